@@ -1,0 +1,1 @@
+"""Makes the data that ships: python -m assets_gen WHAT."""

@@ -1,0 +1,42 @@
+"""Every test runs with the shapes of workbench checked (jaxtyping + beartype), on one thread a process."""
+
+import os
+
+# Before torch and numpy: two xdist workers share two cores, so each gets one thread.
+for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[variable] = "1"
+# Child processes that a test starts must find this checkout's cache nowhere near the user's.
+os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+
+from jaxtyping import install_import_hook
+
+install_import_hook(["workbench", "widgets"], "beartype.beartype")
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(autouse=True, scope="session")
+def single_thread():
+    import torch
+
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def private_cache(tmp_path, monkeypatch):
+    """No test reads or fills the user's cache."""
+    monkeypatch.setenv("WORKBENCH_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="session")
+def body():
+    """The default body, read once a process."""
+    from workbench.body.model import Body
+
+    return Body.default()
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)

@@ -1,0 +1,1 @@
+"""Looking at results: every picture, widget and page. workbench computes, this draws."""

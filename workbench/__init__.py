@@ -1,0 +1,72 @@
+"""Garment workbench: arrays flow from left to right, each stage is one file named as in its paper.
+
+Paper 1: Santesteban, Thuerey, Otaduy, Casas, "Self-Supervised Collision Handling via Generative 3D Garment Models for
+Virtual Try-On", CVPR 2021.
+
+The map
+| stage               | section   | equation | module                                     | in -> out                            |
+|---------------------|-----------|----------|--------------------------------------------|--------------------------------------|
+| body                | 3         | 2-3      | workbench.body.model                       | theta, beta -> M_B (V,3)             |
+| motion              | -         | -        | workbench.motion                           | BVH, AMASS -> theta (T,J,3,3)        |
+| garment             | -         | -        | workbench.garments                         | file -> template (N,3), faces (M,3)  |
+| simulated sequences | 6         | -        | workbench.collisions.sequences             | theta, beta -> M_G (T,N,3)           |
+| diffused body       | 4.1       | 4-6      | workbench.collisions.diffused_body         | p (N,3) -> W~, B~s, B~p              |
+| body SDF            | 4.3       | 12       | workbench.collisions.body_sdf              | p (N,3) -> distance (N,)             |
+| garment model       | 4.2       | 7-8      | workbench.collisions.garment_model         | X, beta, theta -> M_G                |
+| projection          | 4.3       | 9-12     | workbench.collisions.projection            | M_G, beta, theta -> X                |
+| penetration         | 4.3, 6    | -        | workbench.collisions.penetration           | mesh, body -> vertices inside, depth |
+| demo                | -         | -        | workbench.demo                             | simulated -> canonical -> re-posed   |
+
+Notation (declared once, here)
+| symbol        | shape       | meaning                                                            |
+|---------------|-------------|--------------------------------------------------------------------|
+| X             | (N,3)       | canonical garment: unposed, unshaped                               |
+| M_G, M_B      | (N,3) (V,3) | posed garment, posed body                                          |
+| beta          | (10)        | body shape                                                         |
+| theta         | (J,3,3)     | pose: one local rotation matrix a joint                            |
+| W, B_s, B_p   | (V,J) ...   | the body's skinning weights, shape and pose offsets                |
+| W~, B~s, B~p  | (N,J) ...   | the same, diffused to any point of space                           |
+| gamma         | (42)        | motion descriptor                                                  |
+| x_bar         | (25)        | latent garment;  E, D  its encoder and decoder                     |
+| T_i           | (3,3)       | local transform;  n  normal;  r  displacement                      |
+Axes: B batch, T frames, V body vertices, N garment vertices or points, F faces, J joints, K shape components.
+Metres, radians, seconds; z up, the body faces -y, its left is +x; float32 unless said.
+Canonical body: beta = 0, theta = 0, straight-arm A45 rest, soles at z = 0.
+
+Public names are loaded when first used, so `import workbench` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME_OF = {
+    "Body": "workbench.body.model",
+    "Skeleton": "workbench.body.skeleton",
+    "Motion": "workbench.motion",
+    "load_motion": "workbench.formats",
+    "Garment": "workbench.garments",
+    "SimulatedSequence": "workbench.collisions.sequences",
+    "MonteCarloFields": "workbench.collisions.diffused_body",
+    "LearnedFields": "workbench.collisions.diffused_body",
+    "GridFields": "workbench.collisions.diffused_body",
+    "Store": "workbench.store",
+    "atomic_write": "workbench.store",
+    "MeshSequence": "workbench.formats.mesh_sequence",
+    "read_mesh_sequence": "workbench.formats.mesh_sequence",
+}
+
+__all__ = ["__version__", *_HOME_OF]  # noqa: PLE0604 (names come from the table above)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"workbench has no {name!r}; it has {', '.join(sorted(_HOME_OF))}")
+    return getattr(importlib.import_module(_HOME_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
