@@ -4,18 +4,18 @@ Paper 1: Santesteban, Thuerey, Otaduy, Casas, "Self-Supervised Collision Handlin
 Virtual Try-On", CVPR 2021.
 
 The map
-| stage               | section   | equation | module                                     | in -> out                            |
-|---------------------|-----------|----------|--------------------------------------------|--------------------------------------|
-| body                | 3         | 2-3      | workbench.body.model                       | theta, beta -> M_B (V,3)             |
-| motion              | -         | -        | workbench.motion                           | BVH, AMASS -> theta (T,J,3,3)        |
-| garment             | -         | -        | workbench.garments                         | file -> template (N,3), faces (M,3)  |
-| simulated sequences | 6         | -        | workbench.collisions.sequences             | theta, beta -> M_G (T,N,3)           |
-| diffused body       | 4.1       | 4-6      | workbench.collisions.diffused_body         | p (N,3) -> W~, B~s, B~p              |
-| body SDF            | 4.3       | 12       | workbench.collisions.body_sdf              | p (N,3) -> distance (N,)             |
-| garment model       | 4.2       | 7-8      | workbench.collisions.garment_model         | X, beta, theta -> M_G                |
-| projection          | 4.3       | 9-12     | workbench.collisions.projection            | M_G, beta, theta -> X                |
-| penetration         | 4.3, 6    | -        | workbench.collisions.penetration           | mesh, body -> vertices inside, depth |
-| demo                | -         | -        | workbench.demo                             | simulated -> canonical -> re-posed   |
+| stage               | section | eq.  | module                           | in -> out                            |
+|---------------------|---------|------|----------------------------------|--------------------------------------|
+| body                | 3       | 2-3  | workbench.body.model             | theta, beta -> M_B (V,3)             |
+| motion              |         |      | workbench.motion                 | BVH, AMASS -> theta (T,J,3,3)        |
+| garment             |         |      | workbench.garments               | file -> template (N,3), faces (F,3)  |
+| simulated sequences | 6       |      | workbench.collisions.sequences   | theta, beta -> M_G (T,N,3)           |
+| diffused body       | 4.1     | 4-6  | workbench.collisions.diffused_body | p (N,3) -> W~, B~s, B~p            |
+| body SDF            | 4.3     | 12   | workbench.collisions.body_sdf    | p (N,3) -> distance (N,)             |
+| garment model       | 4.2     | 7-8  | workbench.collisions.garment_model | X, beta, theta -> M_G              |
+| projection          | 4.3     | 9-12 | workbench.collisions.projection  | M_G, beta, theta -> X                |
+| penetration         | 4.3, 6  |      | workbench.collisions.penetration | mesh, body -> vertices inside, depth |
+| demo                |         |      | workbench.demo                   | simulated -> canonical -> re-posed   |
 
 Notation (declared once, here)
 | symbol        | shape       | meaning                                                            |
@@ -59,7 +59,7 @@ _HOME_OF = {
     "read_mesh_sequence": "workbench.formats.mesh_sequence",
 }
 
-__all__ = ["__version__", *_HOME_OF]  # noqa: PLE0604 (names come from the table above)
+__all__ = ["__version__", *_HOME_OF]
 
 
 def __getattr__(name: str) -> Any:
