@@ -1,4 +1,4 @@
-"""Optional packages: a module's name and the extra that brings it -> the module, or one line that says what to install."""
+"""Optional packages: a module and the extra that brings it -> the module, or one line that says what to install."""
 
 import importlib
 from types import ModuleType

@@ -6,7 +6,6 @@ process makes it while others wait, and a file that changed since is refused.
 
 import contextlib
 import dataclasses
-import datetime
 import enum
 import hashlib
 import importlib.util
@@ -102,7 +101,7 @@ def describe(value: Any) -> Any:
         return {key: describe(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [describe(entry) for entry in value]
-    if hasattr(value, "detach"):  # a torch tensor, without importing torch
+    if type(value).__module__.partition(".")[0] == "torch":  # tensors, without importing torch
         value = value.detach().cpu().numpy()
     if isinstance(value, np.generic):
         return describe(value.item())
@@ -237,7 +236,6 @@ def add_to_manifest(
         "licence": licence,
         "sha256": file_hash(file),
         "bytes": file.stat().st_size,
-        "made": datetime.date.today().isoformat(),
     }
     with locked(manifest):
         entries = json.loads(manifest.read_text(encoding="utf-8")) if manifest.exists() else {}
