@@ -61,7 +61,7 @@ def format_table(rows: Iterable[Row]) -> str:
 
 
 def to_json(name: str, rows: Iterable[Row]) -> str:
-    """`{"name": ..., "rows": [{"metric", "value", "unit", "bound", "holds"}, ...]}`; a value that is not finite is null."""
+    """`{"name", "rows": [{"metric", "value", "unit", "bound", "holds"}, ...]}`; a value that is not finite is null."""
     entries = [asdict(row) | {"value": row.value if math.isfinite(row.value) else None} for row in rows]
     return json.dumps({"name": name, "rows": entries}, indent=1)
 

@@ -5,17 +5,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Float, Int
 
-# Warp greets on stdout and warns where there is no CUDA driver; neither concerns a CPU workbench
-wp.config.log_level = wp.LOG_ERROR
-wp.init()
-wp.config.log_level = wp.LOG_WARNING
-wp.set_module_options({"enable_backward": False})
+from .warp_kernels import closest_points
 
 CHUNK = 2048  # points below which a second thread costs more than it brings
 
@@ -74,31 +71,10 @@ class ClosestPoint:
 
             def launch(start: int, stop: int) -> None:
                 inputs = [self.mesh.id, start, *arrays]
-                wp.launch(_closest_points, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
+                wp.launch(closest_points, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
 
             run_chunks(launch, n)
         return SurfacePoint(face.astype(np.int64), barycentric, point, distance)
-
-
-@wp.kernel
-def _closest_points(
-    mesh: wp.uint64,
-    start: int,
-    points: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
-    order: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    face: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    barycentric: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
-    closest: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
-    distance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-):
-    i = order[start + wp.tid()]
-    p = points[i]
-    hit = wp.mesh_query_point_no_sign(mesh, p, 1.0e6)
-    q = wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
-    face[i] = hit.face
-    barycentric[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
-    closest[i] = q
-    distance[i] = wp.length(q - p)
 
 
 def morton_order(points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
@@ -118,14 +94,16 @@ def run_chunks(work: Callable[[int, int], None], count: int, *, chunk: int = CHU
     """`work(start, stop)` over [0, count), on two threads where that pays (Warp releases the interpreter lock)."""
     threads = min(2, torch.get_num_threads(), max(1, count // chunk))
     if threads == 1:
-        return work(0, count)
+        work(0, count)
+        return
     # the first points compile the kernel, once, on this thread
     first = min(16, count)
     work(0, first)
     # more pieces than threads, for points differ in cost
     bounds = np.linspace(first, count, 4 * threads + 1).astype(int)
-    for done in [_pool(os.getpid()).submit(work, int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]:
-        done.result()
+    pool = _pool(os.getpid())
+    for piece in [pool.submit(work, int(a), int(b)) for a, b in pairwise(bounds)]:
+        piece.result()
 
 
 @cache

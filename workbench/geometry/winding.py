@@ -5,8 +5,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 
 from .closest_point import checked_mesh, checked_points, morton_order, move_mesh, run_chunks, warp_mesh
-
-wp.set_module_options({"enable_backward": False})
+from .warp_kernels import sum_solid_angles, winding_verdict
 
 # Ours, measured (tests/geometry/test_winding.py): the fast winding number strays less than 0.1 from the exact one at
 # accuracy 2, so a point whose fast value is outside (0.25, 0.75) is decided.
@@ -31,14 +30,14 @@ def winding_number(
 
         def launch(start: int, stop: int) -> None:
             inputs = [start, p, corners, out]
-            wp.launch(_sum_solid_angles, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
+            wp.launch(sum_solid_angles, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
 
         run_chunks(launch, len(points), chunk=32)
     return result.astype(np.float32)
 
 
 class InsideTest:
-    """Which points are inside a closed mesh: exact winding number > 1/2, so the overlap of a posed body counts as inside.
+    """Which points are inside a closed mesh: winding number > 1/2, so the overlap of a posed body counts as inside.
 
     A fast (dipole) winding number decides the clear cases, the exact sum the doubtful ones; `refit` moves the mesh.
     Raises ValueError where the mesh is not closed and consistently oriented, for then "inside" has no meaning.
@@ -68,7 +67,7 @@ class InsideTest:
 
         def launch(start: int, stop: int) -> None:
             inputs = [self.mesh.id, start, p, index, CERTAINLY_OUTSIDE, CERTAINLY_INSIDE, ACCURACY, out]
-            wp.launch(_fast_verdict, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
+            wp.launch(winding_verdict, dim=stop - start, inputs=inputs, device="cpu", record_tape=False)
 
         run_chunks(launch, len(near))
         doubtful = np.flatnonzero(verdict == 2)
@@ -96,49 +95,3 @@ def check_closed(faces: Int[np.ndarray, "F 3"]) -> None:
             f"the mesh is not closed and consistently oriented: {open_edges} of {len(forward)} directed edges have no "
             "opposite; close its holes and orient its faces before asking for its inside"
         )
-
-
-@wp.kernel
-def _sum_solid_angles(
-    start: int,
-    points: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
-    corners: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
-    out: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
-):
-    i = start + wp.tid()
-    p = wp.vec3d(points[i])
-    total = wp.float64(0.0)
-    for f in range(corners.shape[0]):
-        a = wp.vec3d(corners[f, 0]) - p
-        b = wp.vec3d(corners[f, 1]) - p
-        c = wp.vec3d(corners[f, 2]) - p
-        la = wp.length(a)
-        lb = wp.length(b)
-        lc = wp.length(c)
-        volume = wp.dot(a, wp.cross(b, c))
-        base = la * lb * lc + wp.dot(a, b) * lc + wp.dot(b, c) * la + wp.dot(c, a) * lb
-        total += wp.atan2(volume, base)  # half the solid angle
-    out[i] = total / wp.float64(6.283185307179586)
-
-
-@wp.kernel
-def _fast_verdict(
-    mesh: wp.uint64,
-    start: int,
-    points: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
-    index: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    low: float,
-    high: float,
-    accuracy: float,
-    verdict: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-):
-    i = index[start + wp.tid()]
-    p = points[i]
-    above_low = wp.mesh_query_point_sign_winding_number(mesh, p, 1.0e6, accuracy, low)
-    result = int(0)
-    if above_low.sign < 0.0:
-        above_high = wp.mesh_query_point_sign_winding_number(mesh, p, 1.0e6, accuracy, high)
-        result = int(2)
-        if above_high.sign < 0.0:
-            result = int(1)
-    verdict[i] = result

@@ -1,0 +1,96 @@
+# pyright: basic, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+"""Warp kernels of the geometry: one row of the output a thread.  Compiled at first use, cached by Warp afterwards."""
+
+import os
+
+import warp as wp
+
+
+def _initialise_quietly() -> None:
+    """Start Warp without its greeting and without its (native, unconditional) stderr line about a missing GPU driver:
+    the command line promises one clear line on stderr, and a CPU is all that is asked for here."""
+    wp.config.log_level = wp.LOG_ERROR
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        wp.init()
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+    wp.config.log_level = wp.LOG_WARNING
+
+
+_initialise_quietly()
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def closest_points(
+    mesh: wp.uint64,
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    order: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+    barycentric: wp.array(dtype=wp.vec3),
+    closest: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=wp.float32),
+):
+    """phi of Eq. 4-6 for the points order[start], order[start + 1], ..."""
+    i = order[start + wp.tid()]
+    p = points[i]
+    hit = wp.mesh_query_point_no_sign(mesh, p, 1.0e6)
+    q = wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
+    face[i] = hit.face
+    barycentric[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+    closest[i] = q
+    distance[i] = wp.length(q - p)
+
+
+@wp.kernel
+def sum_solid_angles(
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    corners: wp.array2d(dtype=wp.vec3),
+    winding: wp.array(dtype=wp.float64),
+):
+    """Sum of the signed solid angles of all faces over 4 pi, in double precision."""
+    i = start + wp.tid()
+    p = wp.vec3d(points[i])
+    half = wp.float64(0.0)
+    for f in range(corners.shape[0]):
+        a = wp.vec3d(corners[f, 0]) - p
+        b = wp.vec3d(corners[f, 1]) - p
+        c = wp.vec3d(corners[f, 2]) - p
+        la = wp.length(a)
+        lb = wp.length(b)
+        lc = wp.length(c)
+        volume = wp.dot(a, wp.cross(b, c))
+        base = la * lb * lc + wp.dot(a, b) * lc + wp.dot(b, c) * la + wp.dot(c, a) * lb
+        half += wp.atan2(volume, base)
+    winding[i] = half / wp.float64(6.283185307179586)
+
+
+@wp.kernel
+def winding_verdict(
+    mesh: wp.uint64,
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    index: wp.array(dtype=wp.int32),
+    low: float,
+    high: float,
+    accuracy: float,
+    verdict: wp.array(dtype=wp.int32),
+):
+    """0 where the fast winding number is below `low`, 1 above `high`, 2 between: Warp tells only on which side of a
+    threshold it is, hence two questions."""
+    i = index[start + wp.tid()]
+    p = points[i]
+    above_low = wp.mesh_query_point_sign_winding_number(mesh, p, 1.0e6, accuracy, low)
+    result = int(0)  # noqa: UP018  a variable for Warp, not a constant
+    if above_low.sign < 0.0:
+        above_high = wp.mesh_query_point_sign_winding_number(mesh, p, 1.0e6, accuracy, high)
+        result = int(2)  # noqa: UP018
+        if above_high.sign < 0.0:
+            result = int(1)  # noqa: UP018
+    verdict[i] = result
