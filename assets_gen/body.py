@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 BODY_TOPOLOGY = "anny-noeyes-notongue"
 HELPER_TOPOLOGY = "makehuman"
 ARM_ANGLE = np.pi / 4  # below the horizontal: the A45 rest
+END_VERTICES = 400  # enough at crown and soles to hold the highest and lowest vertex of any shape
 SOLE_HEIGHT = 0.02  # vertices lower than this in rest stand on the floor
 
 
@@ -36,6 +37,11 @@ class BodyConfig:
     youngest: float = 20.0  # years; adults only, so that stature is close to normal
     oldest: float = 60.0
     seed: int = 0
+    # Mean stature of each sex and its spread within a sex, metres: adults worldwide (NCD-RisC 2016).  Anny's own calibration gives
+    # 1.78 / 1.60 and 0.08, 0.12 m over all.
+    male_stature: float = 1.715
+    female_stature: float = 1.595
+    stature_spread: float = 0.07
     correctives: CorrectivesConfig = CorrectivesConfig()
 
 
@@ -77,7 +83,7 @@ def run(config: BodyConfig) -> Body:
 
 
 def sample_population(model: Any, config: BodyConfig, generator: np.random.Generator) -> Population:
-    """Adults as Anny's own calibration (WHO statures by age and sex) distributes them; sex is binary, ages uniform."""
+    """Adults as Anny's own calibration distributes them, with statures set to those of real adults; sex is binary."""
     from anny.shape_distribution import SimpleShapeDistribution
 
     law = SimpleShapeDistribution(model)
@@ -91,6 +97,9 @@ def sample_population(model: Any, config: BodyConfig, generator: np.random.Gener
             for sex in ("boys", "girls")
         ]
         phenotype[trait] = torch.where(gender <= 0.5, *sexes)
+    for sex, target in ((gender <= 0.5, config.male_stature), (gender > 0.5, config.female_stature)):
+        adults = {trait: values[sex] for trait, values in phenotype.items()}
+        phenotype["height"][sex] = calibrated_height(model, adults, target, config.stature_spread)
     coefficients = model.get_phenotype_blendshape_coefficients(**phenotype).numpy()
 
     def stacked(template: Any, blendshapes: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -104,6 +113,31 @@ def sample_population(model: Any, config: BodyConfig, generator: np.random.Gener
 def _beta_samples(law: Any, age: torch.Tensor, generator: np.random.Generator) -> torch.Tensor:
     alpha, beta = law.get_distribution_params(age)
     return torch.from_numpy(generator.beta(alpha.numpy(), beta.numpy())).to(age.dtype)
+
+
+def calibrated_height(model: Any, phenotype: dict[str, torch.Tensor], mean: float, spread: float) -> torch.Tensor:
+    """The trait 'height', shifted and scaled so that stature has this mean and standard deviation (metres).
+
+    Stature = slope * height + the other traits' part, independent of it; the slope is a regression over the sample.
+    """
+    height = phenotype["height"]
+    stature = statures(model, phenotype)
+    centred = height - height.mean()
+    slope = (centred @ (stature - stature.mean())) / (centred @ centred)
+    rest = (stature - slope * height).var()
+    if spread**2 <= rest:
+        raise ValueError(f"the other traits alone spread stature by {rest.sqrt():.3f} m, more than the {spread} m asked for")
+    scale = (spread**2 - rest).sqrt() / (slope.abs() * height.std())
+    return height.mean() + (mean - stature.mean()) / slope + scale * centred
+
+
+def statures(model: Any, phenotype: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Height of the mesh of each phenotype, metres."""
+    z = model.template_vertices[:, 2].double()
+    ends = torch.cat([z.topk(END_VERTICES).indices, (-z).topk(END_VERTICES).indices])
+    coefficients = model.get_phenotype_blendshape_coefficients(**phenotype).double()
+    heights = z[ends] + coefficients @ model.blendshapes[:, ends, 2].double()
+    return heights.max(dim=1).values - heights.min(dim=1).values
 
 
 def shape_space(population: Population, components: int) -> ShapeSpace:
