@@ -1,0 +1,61 @@
+"""Files of others, one format a module, and load_motion: any motion file -> Motion on a body's skeleton."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from workbench.body.model import Body
+from workbench.formats.amass import amass_motion, is_amass
+from workbench.formats.bvh import read_bvh
+from workbench.motion import Motion, is_own_motion, read_arrays
+from workbench.retargeting import RetargetConfig, retarget
+
+__all__ = ["load_motion"]
+
+
+def load_motion(
+    path: str | Path,
+    body: Body,
+    *,
+    fps: float | None = None,
+    mapping: Mapping[str, str] | None = None,
+    config: RetargetConfig | None = None,
+) -> Motion:
+    """Read a motion file and carry it over to the body: BVH, AMASS npz, or our own npz.
+
+    The frame rate is that of the file; fps says what it really is where the file is wrong (it does not resample:
+    `Motion.resampled` does).  mapping {role: joint} names joints that no known convention has (see `retargeting`).
+    Raises FileNotFoundError, or ValueError naming the file and what is wrong with it.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind == ".bvh":
+        motion = read_bvh(path, fps=fps)
+    elif kind == ".npz":
+        arrays = read_arrays(path)
+        if is_own_motion(arrays):
+            motion = Motion.load(path) if fps is None else Motion.load(path).at_rate(fps)
+            if _is_made_for(motion, body):
+                return Motion(motion.rotations, motion.translation, motion.fps, body.skeleton, motion.name)
+        elif is_amass(arrays):
+            motion = amass_motion(arrays, path, fps=fps)
+        else:
+            raise ValueError(
+                f"{path} holds no motion: it is neither ours (no entry 'format') nor AMASS (no 'poses'), "
+                f"but has {', '.join(sorted(arrays)) or 'nothing'}"
+            )
+    else:
+        raise ValueError(f"{path}: motions are read from .bvh (any known rig) and .npz (AMASS, ours) files, not {kind!r}")
+    try:
+        return retarget(motion, body.skeleton, mapping=mapping, config=config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _is_made_for(motion: Motion, body: Body) -> bool:
+    """Same tree and rest joints to a millimetre: nothing to retarget."""
+    skeleton = body.skeleton
+    return motion.skeleton.same_tree(skeleton) and torch.allclose(
+        motion.skeleton.rest_joints, skeleton.rest_joints, rtol=0, atol=1e-3
+    )

@@ -1,0 +1,484 @@
+"""Retargeting: a motion of any known rig -> the same motion on another skeleton, in metres, z up, on the floor.
+
+For a joint of the target that has a counterpart in the source, with global rotations G relative to the two rests,
+    G_target(t) = C_world G_source(t) C_rest^-1 A,
+C takes the source's axes to ours (z up, facing -y) and A takes the target's rest pose to the source's: the smallest
+rotation between the rest directions of a limb's bone, turned about it so that elbows and knees fold about the same axis.
+The spine, neck and clavicles are not aligned (A = I): their bones run differently in every rig, their flesh does not.
+A joint without counterpart keeps its rest rotation relative to its parent.
+"""
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from workbench.body.skeleton import Skeleton
+from workbench.body.skinning import forward_kinematics
+from workbench.geometry.rotations import axis_angle_to_matrix, rotation_angle, smallest_rotation
+from workbench.motion import Motion
+
+log = logging.getLogger(__name__)
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+Y_UP_FROM_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+"""Takes z up, facing -y to y up, facing +z."""
+
+_FORWARD = (0.0, -1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class RetargetConfig:
+    """How a motion is carried over.
+
+    world_up: the vertical axis of the source's world; None: that of its rest pose, as nearly every file has it.
+    drop_t_pose: leave out the calibration frames at the source's T-pose with which many clips start.
+    t_pose_arms, t_pose_legs: how near to the rest pose a frame counts as T-pose, in degrees; ours: the CMU conversions
+    start with arms 5 and legs 17 degrees off.  t_pose_jump: the arms' speed in rad/s above which the frames after a
+    T-pose still belong to the jump out of it; ours: people stay below 20.
+    on_floor: lift or lower the clip so that its lowest foot stands at z = 0.  floor_quantile: the share of frames that
+    may go below, so that one slip of the capture does not make the body float; ours: measured on four real clips.
+    largest_twist: an elbow or knee axis further from the usual one than this is taken for noise, in degrees; ours.
+    """
+
+    world_up: Axis | None = None
+    drop_t_pose: bool = True
+    t_pose_arms: float = 10.0
+    t_pose_legs: float = 25.0
+    t_pose_jump: float = 20.0
+    on_floor: bool = True
+    floor_quantile: float = 0.1
+    largest_twist: float = 60.0
+
+
+# Names: a role is a joint of the default rig (cmu_mb); a convention says what others call it, best name first.
+
+_SIDES = ("Left", "Right")
+_LIMBS = ("UpLeg", "Leg", "Foot", "Arm", "ForeArm", "Hand")
+REQUIRED_ROLES = ("Hips", *(side + limb for side in _SIDES for limb in _LIMBS))
+
+
+def _sided(left: Mapping[str, str], from_left: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """A table with both sides, from that of the left side and what turns left names into right ones."""
+
+    def right(name: str) -> str:
+        for old, new in from_left.items():
+            if name.startswith(old):
+                return new + name[len(old) :]
+        return name
+
+    both = {role: tuple(names.split()) for role, names in left.items()}
+    for role, names in left.items():
+        other = "Right" + role[4:] if role.startswith("Left") else "R" + role[1:] if role[:2] in ("LH", "LT") else role
+        both.setdefault(other, tuple(right(name) for name in names.split()))
+    return both
+
+
+CONVENTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "CMU / MotionBuilder": _sided(
+        {
+            **{role: role for role in ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LHipJoint", "LThumb")},
+            **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "ToeBase", "Shoulder", "FingerBase")},
+            "LeftHandFinger1": "LeftHandFinger1 LFingers LeftHandIndex1",
+        },
+        {"Left": "Right", "L": "R"},
+    ),
+    "Mixamo": _sided(
+        {
+            **{"Hips": "Hips", "LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2", "Neck": "Neck", "Head": "Head"},
+            **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "Shoulder")},
+            "LeftToeBase": "LeftToeBase LeftToe",
+            "LeftFingerBase": "LeftHandMiddle1",
+            "LeftHandFinger1": "LeftHandMiddle2",
+            "LThumb": "LeftHandThumb1",
+        },
+        {"Left": "Right"},
+    ),
+    "DAZ / Poser": _sided(
+        {
+            "Hips": "hip",
+            "LowerBack": "abdomen abdomenLower",
+            "Spine": "chest abdomenUpper",
+            "Spine1": "chestUpper chestLower",
+            "Neck": "neck neckLower",
+            "Neck1": "neckUpper",
+            "Head": "head",
+            "LeftUpLeg": "lThigh lThighBend",
+            "LeftLeg": "lShin",
+            "LeftFoot": "lFoot",
+            "LeftToeBase": "lToe lToes",
+            "LeftShoulder": "lCollar",
+            "LeftArm": "lShldr lShldrBend",
+            "LeftForeArm": "lForeArm lForearmBend",
+            "LeftHand": "lHand",
+            "LeftFingerBase": "lMid1",
+            "LeftHandFinger1": "lMid2",
+            "LThumb": "lThumb1",
+        },
+        {"l": "r"},
+    ),
+    "SMPL": _sided(
+        {
+            "Hips": "pelvis",
+            "LowerBack": "spine1",
+            "Spine": "spine2",
+            "Spine1": "spine3",
+            "Neck": "neck",
+            "Head": "head",
+            "LeftUpLeg": "left_hip L_Hip",
+            "LeftLeg": "left_knee L_Knee",
+            "LeftFoot": "left_ankle L_Ankle",
+            "LeftToeBase": "left_foot L_Foot",
+            "LeftShoulder": "left_collar L_Collar",
+            "LeftArm": "left_shoulder L_Shoulder",
+            "LeftForeArm": "left_elbow L_Elbow",
+            "LeftHand": "left_wrist L_Wrist",
+            "LeftFingerBase": "left_hand left_middle1 L_Hand",
+        },
+        {"left": "right", "L_": "R_"},
+    ),
+}
+
+
+def _plain(name: str) -> str:
+    """A joint name without namespace ('mixamorig:', 'mixamorig1_', 'm_avg_'), in small letters."""
+    return re.sub(r"^(?:.*:|mixamorig\d*_|[mf]_avg_)", "", name).lower()
+
+
+def roles_of(skeleton: Skeleton, mapping: Mapping[str, str] | None = None) -> dict[str, int]:
+    """Which joint plays which role (joint name of the default rig -> index), by the best fitting convention.
+
+    mapping {role: joint name} adds to it and overrides it.  Raises ValueError listing the required roles that no joint
+    plays, or the entries of mapping that name nothing.
+    """
+    joints = {_plain(name): j for j, name in reversed(list(enumerate(skeleton.names)))}
+
+    def recognised(table: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
+        found = {role: next((joints[n.lower()] for n in names if n.lower() in joints), -1) for role, names in table.items()}
+        return {role: j for role, j in found.items() if j >= 0}
+
+    best_name, best = max(
+        ((name, recognised(table)) for name, table in CONVENTIONS.items()),
+        key=lambda entry: (sum(role in entry[1] for role in REQUIRED_ROLES), len(entry[1])),
+    )
+    roles = dict(best)
+    for role, name in (mapping or {}).items():
+        if role not in CONVENTIONS["CMU / MotionBuilder"]:
+            raise ValueError(f"mapping names the role {role!r}; roles are {', '.join(CONVENTIONS['CMU / MotionBuilder'])}")
+        if name not in skeleton.names:
+            raise ValueError(f"mapping takes {role} from the joint {name!r}, but the motion has {', '.join(skeleton.names)}")
+        roles[role] = skeleton.index(name)
+    missing = [role for role in REQUIRED_ROLES if role not in roles]
+    if missing:
+        raise ValueError(
+            f"these joint names follow none of the known conventions ({', '.join(CONVENTIONS)}; nearest: {best_name}): "
+            f"no joint was found for {', '.join(missing)}; the joints are {', '.join(skeleton.names)}; "
+            f"pass mapping={{role: joint name}} for what is missing"
+        )
+    return roles
+
+
+# Frames of reference
+
+
+def reframed(motion: Motion, turn: Float[Tensor, "3 3"], scale: float = 1.0) -> Motion:
+    """The same motion in axes turned by `turn` and in units of 1/scale: rest and world alike."""
+    turn = turn.double()
+    skeleton = reframed_skeleton(motion.skeleton, turn, scale)
+    rotations = turn @ motion.rotations.double() @ turn.mT
+    translation = scale * motion.translation.double() @ turn.mT
+    return replace(motion, rotations=rotations.float(), translation=translation.float(), skeleton=skeleton)
+
+
+def reframed_skeleton(skeleton: Skeleton, turn: Float[Tensor, "3 3"], scale: float = 1.0) -> Skeleton:
+    """The same rest pose in axes turned by `turn` and in units of 1/scale."""
+    return replace(skeleton, rest_joints=(scale * skeleton.rest_joints.double() @ turn.double().mT).float())
+
+
+def _snapped(direction: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """The coordinate axis nearest to a direction, or the direction itself if none is within 25 degrees."""
+    direction = direction / direction.norm()
+    nearest = direction.abs().argmax()
+    if direction[nearest].abs() < 0.906:
+        return direction
+    return torch.eye(3, dtype=direction.dtype)[nearest] * direction[nearest].sign()
+
+
+def upright_turn(skeleton: Skeleton, roles: Mapping[str, int]) -> Float[Tensor, "3 3"]:
+    """The rotation that takes the rest pose to z up, facing -y; from where its hips and shoulders are.
+
+    Raises ValueError when hips and shoulders span no plane.
+    """
+    rest = skeleton.rest_joints.double()
+
+    def at(role: str) -> Tensor:
+        return rest[roles[role]]
+
+    up = at("LeftArm") + at("RightArm") - at("LeftUpLeg") - at("RightUpLeg")
+    left = at("LeftUpLeg") - at("RightUpLeg")
+    size = (rest - rest[0]).norm(dim=-1).max()
+    if torch.linalg.cross(up, left).norm() <= 1e-4 * size**2:
+        raise ValueError(
+            "hips and shoulders of the rest pose span no plane, so which way it faces is unknown; "
+            "export the motion with a standing rest pose (T or A)"
+        )
+    z = _snapped(up)
+    x = _snapped(left - (left @ z) * z)
+    x = x - (x @ z) * z  # a diagonal facing stays diagonal, but upright
+    x = x / x.norm()
+    return torch.stack([x, torch.linalg.cross(z, x), z])
+
+
+# What differs between two rest poses
+
+
+def _bone_direction(skeleton: Skeleton, roles: Mapping[str, int], role: str, next_role: str) -> Tensor | None:
+    """Rest vector from the joint of role to that of next_role, or to the first of its descendants apart from it."""
+    rest, start = skeleton.rest_joints.double(), roles[role]
+    reach = (rest - rest[0]).norm(dim=-1).max()
+    first = roles.get(next_role)
+    if first is None and skeleton.children(start):
+        first = skeleton.children(start)[0]
+    for joint in skeleton.descendants(first) if first is not None else ():
+        vector = rest[joint] - rest[start]
+        if vector.norm() > 1e-4 * reach:
+            return vector
+    return None
+
+
+def _heading(direction: Tensor) -> Tensor | None:
+    """The horizontal part of a direction; None for a vertical one."""
+    flat = direction * direction.new_tensor([1.0, 1.0, 0.0])
+    return flat if flat.norm() > 0.2 * direction.norm() else None
+
+
+def _hinge_twist(
+    bend: Float[Tensor, "T 3 3"],
+    source_bone: Float[Tensor, "3"],
+    target_bone: Float[Tensor, "3"],
+    fold: Float[Tensor, "3"],
+    largest: float,
+) -> float:
+    """The angle about the bone that takes the target's folding axis onto the source's, in radians.
+
+    bend (T,3,3): the source joint's rotation relative to the limb's first bone.  The source's axis is measured from the
+    motion: the mean of d x bend d over time; the target folds towards `fold`.  0 when it never folds, or about no one axis.
+    """
+    d = source_bone / source_bone.norm()
+    folding = torch.linalg.cross(d.expand(len(bend), 3), bend @ d)
+    mean = folding.mean(0)
+    if mean.norm() < 0.05 or mean.norm() < 0.9 * folding.norm(dim=-1).mean():
+        return 0.0
+    axis = smallest_rotation(target_bone, source_bone) @ torch.linalg.cross(target_bone, fold)
+    angle = torch.atan2(torch.linalg.cross(axis, mean) @ d, axis @ mean - (axis @ d) * (mean @ d))
+    return float(angle) if angle.abs() <= torch.deg2rad(torch.tensor(largest)) else 0.0
+
+
+def rest_alignment(
+    source: Skeleton,
+    target: Skeleton,
+    source_roles: Mapping[str, int],
+    target_roles: Mapping[str, int],
+    source_world: Float[Tensor, "T J 3 3"],
+    config: RetargetConfig,
+) -> dict[str, Float[Tensor, "3 3"]]:
+    """A of each limb's role: from the target's rest to the source's, both z up and facing -y.
+
+    source_world (T,J,3,3): the source's global rotations, in the same axes; elbows and knees are measured from them.
+    """
+    backward, forward = -torch.tensor(_FORWARD, dtype=torch.float64), torch.tensor(_FORWARD, dtype=torch.float64)
+    A: dict[str, Tensor] = {}
+    for side in _SIDES:
+        for chain, fold in ((("Arm", "ForeArm", "Hand", "FingerBase"), forward), (("UpLeg", "Leg", "Foot"), backward)):
+            first, second, third = (side + part for part in chain[:3])
+            bones = []
+            for role, next_role in ((first, second), (second, third)):
+                pair = [_bone_direction(s, r, role, next_role) for s, r in ((target, target_roles), (source, source_roles))]
+                if pair[0] is None or pair[1] is None:
+                    which = "source" if pair[1] is None else "target"
+                    raise ValueError(f"in the {which}'s rest pose the bone from {role} to {next_role} has no length")
+                bones.append(pair)
+            swings = [smallest_rotation(t, s) for t, s in bones]
+            twist = 0.0
+            # Two rests that agree to a degree are one rest: there motion carries over unchanged.
+            if max(float(rotation_angle(swing)) for swing in swings) > 0.0175:
+                bend = source_world[:, source_roles[first]].mT @ source_world[:, source_roles[second]]
+                twist = _hinge_twist(bend, bones[1][1], bones[1][0], fold, config.largest_twist)
+            for role, (_, s), swing in zip((first, second), bones, swings):
+                A[role] = axis_angle_to_matrix(twist * s / s.norm()) @ swing
+            if len(chain) == 4:  # a hand continues its forearm
+                ends = [
+                    _bone_direction(s, r, third, side + chain[3]) for s, r in ((target, target_roles), (source, source_roles))
+                ]
+                known = ends[0] is not None and ends[1] is not None
+                A[third] = smallest_rotation(ends[0], ends[1]) if known else A[second]
+        # Soles are flat on the floor in every rest pose, at whatever slope the ankle-to-toe bone runs: align the heading.
+        foot, toe = side + "Foot", side + "ToeBase"
+        ends = [_bone_direction(s, r, foot, toe) for s, r in ((target, target_roles), (source, source_roles))]
+        flat = [None if end is None else _heading(end) for end in ends]
+        known = flat[0] is not None and flat[1] is not None
+        A[foot] = smallest_rotation(flat[0], flat[1]) if known else torch.eye(3, dtype=torch.float64)
+        A[toe] = A[foot]
+        for finger in ("FingerBase", "HandFinger1"):
+            A[side + finger] = A[side + "Hand"]
+        A[side[0] + "Thumb"] = A[side + "Hand"]
+    return A
+
+
+# Frames at the start that are no motion
+
+
+def t_pose_frames(
+    source: Skeleton, roles: Mapping[str, int], world: Float[Tensor, "T J 3 3"], fps: float, config: RetargetConfig
+) -> int:
+    """How many frames at the start stand in the source's T-pose or jump out of it; 0 if its rest is no T-pose."""
+    pelvis = world[:, roles["Hips"]].mT
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    at_rest = torch.ones(len(world), dtype=torch.bool)
+    arms = []
+    for side, lateral in zip(_SIDES, (1.0, -1.0)):
+        for role, next_role in (("Arm", "ForeArm"), ("ForeArm", "Hand"), ("UpLeg", "Leg"), ("Leg", "Foot")):
+            bone = _bone_direction(source, roles, side + role, side + next_role)
+            if bone is None:
+                return 0
+            d = bone / bone.norm()
+            if role == "Arm" and not (lateral * d[0] > 0.8 and d[2].abs() < 0.5):
+                return 0
+            posed = pelvis @ world[:, roles[side + role]] @ d
+            limit = config.t_pose_arms if "Arm" in role else config.t_pose_legs
+            at_rest &= _angle_between(posed, d) < torch.deg2rad(torch.tensor(limit))
+            if "Arm" in role:
+                arms.append(posed)
+    at_rest &= (world[:, roles["Hips"]] @ up)[:, 2] > 0.5
+    lead = _leading(at_rest)
+    if lead in (0, len(world)):
+        return 0
+    moving = torch.stack(arms)
+    speed = _angle_between(moving[:, 1:], moving[:, :-1]).amax(0) * fps
+    longest = min(lead + round(0.25 * fps), len(world) - 1)
+    while lead < longest and speed[lead] > config.t_pose_jump:
+        lead += 1
+    return lead
+
+
+def _leading(flags: Bool[Tensor, "T"]) -> int:
+    return len(flags) if flags.all() else int((~flags).nonzero()[0])
+
+
+def _angle_between(a: Float[Tensor, "*#B 3"], b: Float[Tensor, "*#B 3"]) -> Float[Tensor, "..."]:
+    a, b = torch.broadcast_tensors(a, b)
+    return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
+
+
+# The floor
+
+
+def sole_heights(
+    skeleton: Skeleton, roles: Mapping[str, int], rotation: Float[Tensor, "T J 3 3"], joints: Float[Tensor, "T J 3"]
+) -> Float[Tensor, "T"]:
+    """Height of the lowest point of both soles in each frame.  The rest pose (z up) stands with its soles at z = 0."""
+    rest = skeleton.rest_joints.double()
+    heights = []
+    for side in _SIDES:
+        foot = roles[side + "Foot"]
+        toe = roles.get(side + "ToeBase", foot)
+        forward = rest[toe] - rest[foot]
+        length = forward.norm() if toe != foot else rest.new_tensor(0.0)
+        # heel and ball below the foot's two joints, tip half a foot bone ahead of the ball
+        tip = rest[toe] + 0.5 * length * torch.tensor(_FORWARD, dtype=torch.float64)
+        for joint, point in ((foot, rest[foot]), (foot, rest[toe]), (toe, tip)):
+            on_sole = point * point.new_tensor([1.0, 1.0, 0.0])
+            heights.append((joints[:, joint] + rotation[:, joint] @ (on_sole - rest[joint]))[:, 2])
+    return torch.stack(heights).amin(0)
+
+
+# The stage
+
+
+def retarget(
+    motion: Motion,
+    skeleton: Skeleton,
+    *,
+    mapping: Mapping[str, str] | None = None,
+    config: RetargetConfig | None = None,
+) -> Motion:
+    """Carry a motion over to another skeleton: the result is in metres, z up, at the motion's frame rate.
+
+    motion: on its own skeleton, in any units and axes (as `formats.bvh` and `formats.amass` read it).  skeleton: the
+    target, in metres; rest pose z up, facing -y (or as SMPL has it, y up).  mapping {role: joint of the motion} names
+    joints that no convention knows; roles are the joint names of the default rig.  The path is scaled by leg length;
+    the pelvis is carried over at the middle of the hip joints.
+    Raises ValueError for unknown joint names, rest poses without direction, limbs without length.
+    """
+    config = config or RetargetConfig()
+    source_roles, target_roles = roles_of(motion.skeleton, mapping), roles_of(skeleton)
+    source_turn, target_turn = upright_turn(motion.skeleton, source_roles), upright_turn(skeleton, target_roles)
+    source = reframed_skeleton(motion.skeleton, source_turn)
+    target = reframed_skeleton(skeleton, target_turn)
+
+    world_turn = source_turn if config.world_up is None else _turn_up(config.world_up)
+    local = motion.rotations.double()
+    posed = forward_kinematics(local, motion.skeleton.rest_joints.double(), motion.skeleton.parents)
+    world = world_turn @ posed.transforms.rotation @ source_turn.mT
+    places = (posed.joints + motion.translation.double()[:, None]) @ world_turn.mT
+
+    start = t_pose_frames(source, source_roles, world, motion.fps, config) if config.drop_t_pose else 0
+    if start:
+        log.info("%s: dropped %d T-pose frames at its start", motion.name or "motion", start)
+    world, places = world[start:], places[start:]
+
+    A = rest_alignment(source, target, source_roles, target_roles, world, config)
+    identity = torch.eye(3, dtype=torch.float64)
+    role_of = {j: role for role, j in target_roles.items()}
+    turned: list[Tensor] = []
+    for j, parent in enumerate(target.parents):
+        role = role_of.get(j)
+        if role in source_roles:
+            turned.append(world[:, source_roles[role]] @ A.get(role, identity))
+        else:
+            turned.append(turned[parent] if parent >= 0 else identity.repeat(len(world), 1, 1))
+    G = torch.stack(turned, dim=1)
+    parents = list(target.parents)
+    rotations = torch.cat([G[:, :1], G[:, parents[1:]].mT @ G[:, 1:]], dim=1)
+
+    scale = _leg_length(target, target_roles) / _leg_length(source, source_roles)
+    rest = target.rest_joints.double()
+    hips = [target_roles[side + "UpLeg"] for side in _SIDES]
+    posed = forward_kinematics(rotations, rest, target.parents)
+    source_middle = places[:, [source_roles[side + "UpLeg"] for side in _SIDES]].mean(1)
+    root = scale * source_middle - (posed.joints[:, hips].mean(1) - rest[0])
+    if config.on_floor:
+        joints = posed.joints + (root - rest[0])[:, None]
+        heights = sole_heights(target, target_roles, G, joints)
+        root = root - heights.quantile(config.floor_quantile) * root.new_tensor([0.0, 0.0, 1.0])
+
+    # Back to the axes of the target's own rest; its root then stands the body up in the world.
+    rotations = target_turn.mT @ rotations @ target_turn
+    rotations[:, 0] = target_turn @ rotations[:, 0]
+    return Motion(
+        rotations=rotations.float(),
+        translation=(root - skeleton.rest_joints[0].double()).float(),
+        fps=motion.fps,
+        skeleton=skeleton,
+        name=motion.name,
+    )
+
+
+def _turn_up(axis: Axis) -> Float[Tensor, "3 3"]:
+    up = torch.eye(3, dtype=torch.float64)["xyz".index(axis[-1])] * (-1.0 if axis[0] == "-" else 1.0)
+    return smallest_rotation(up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def _leg_length(skeleton: Skeleton, roles: Mapping[str, int]) -> float:
+    """Thigh and shin, mean of both sides."""
+    rest, total = skeleton.rest_joints.double(), 0.0
+    for side in _SIDES:
+        hip, knee, ankle = (rest[roles[side + part]] for part in ("UpLeg", "Leg", "Foot"))
+        total += float((knee - hip).norm() + (ankle - knee).norm())
+    return total / len(_SIDES)
