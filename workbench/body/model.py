@@ -13,14 +13,50 @@ from torch import Tensor
 
 from workbench.body.skeleton import Skeleton
 from workbench.body.skinning import Pose, RigidTransforms, dual_quaternion, forward_kinematics, linear_blend
+from workbench.npz import read_npz
 
 Skinning = Literal["linear", "dual_quaternion"]
 
 SMPL_JOINTS = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
-    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist "
-    "left_hand right_hand"
-).split()
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hand",
+    "right_hand",
+)
+
+REQUIRED_ARRAYS = (
+    "name",
+    "template",
+    "shape_directions",
+    "pose_directions",
+    "pose_map",
+    "weights",
+    "joint_template",
+    "joint_directions",
+    "faces",
+    "parents",
+    "joint_names",
+)
 
 
 @dataclass(frozen=True)
@@ -46,9 +82,6 @@ class Body:
     uv: Float[Tensor, "U 2"] | None = None
     uv_faces: Int[Tensor, "F 3"] | None = None
 
-    def __post_init__(self) -> None:
-        _check_arrays(self)
-
     @property
     def skeleton(self) -> Skeleton:
         return Skeleton(names=self.joint_names, parents=self.parents, rest_joints=self.joint_template)
@@ -59,7 +92,7 @@ class Body:
 
     @staticmethod
     def default() -> "Body":
-        """The body that ships: 13,348 vertices, 31 joints, 10 shape components; baked by `python -m assets_gen body`."""
+        """The body that ships: 13,348 vertices, 31 joints, 10 shapes; baked by `python -m assets_gen body`."""
         return _default_body()
 
     @staticmethod
@@ -71,8 +104,10 @@ class Body:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"no body file at {path}; pass our own .npz, or an SMPL-format .npz or .pkl")
-        if path.suffix == ".npz" and _is_own_format(path):
-            return _read_own(path)
+        if path.suffix == ".npz":
+            arrays = read_npz(path, "a body of ours or of SMPL format")
+            if "pose_map" in arrays:
+                return body_from_arrays(arrays)
         from workbench.formats.smpl import read_smpl  # heavy and rare
 
         return _from_smpl(read_smpl(path), name=path.stem)
@@ -102,9 +137,7 @@ class Body:
         def moved(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=dtype if tensor.is_floating_point() else None)
 
-        return replace(
-            self, **{key: moved(value) for key, value in vars(self).items() if isinstance(value, Tensor)}
-        )
+        return replace(self, **{key: moved(value) for key, value in vars(self).items() if isinstance(value, Tensor)})
 
     # B_s, B_p and J of Eq. 3
 
@@ -151,9 +184,7 @@ class Body:
         transforms = RigidTransforms(posed.transforms.rotation, posed.transforms.translation + shift)
         return Pose(transforms, posed.joints + shift)
 
-    def unposed(
-        self, rotations: Float[Tensor, "*R J 3 3"], betas: Float[Tensor, "*S K"]
-    ) -> Float[Tensor, "*B V 3"]:
+    def unposed(self, rotations: Float[Tensor, "*R J 3 3"], betas: Float[Tensor, "*S K"]) -> Float[Tensor, "*B V 3"]:
         """T_b(beta, theta) = T_b + B_s(beta) + B_p(theta)      (Eq. 3)"""
         return self.template + self.shape_offsets(betas) + self.pose_offsets(rotations)
 
@@ -186,9 +217,7 @@ class Body:
 
     def _check_betas(self, betas: Tensor) -> None:
         if betas.shape[-1] != self.shape_count:
-            raise ValueError(
-                f"betas have {betas.shape[-1]} components, but body '{self.name}' has {self.shape_count} shape components"
-            )
+            raise ValueError(f"betas have {betas.shape[-1]} components, but body '{self.name}' has {self.shape_count}")
 
     def _check_rotations(self, rotations: Tensor) -> None:
         if rotations.shape[-3] != len(self.parents):
@@ -199,7 +228,11 @@ class Body:
 
 
 def body_from_arrays(arrays: dict[str, np.ndarray]) -> Body:
-    """Build a body from numpy arrays named as the fields of `Body` (as stored on disk)."""
+    """Build a body from numpy arrays named as the fields of `Body` (as stored on disk).
+
+    Errors: ValueError naming the first array that is missing, misshapen, not finite or inconsistent.
+    """
+    _check_arrays(arrays)
 
     def real(key: str) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(arrays[key], dtype=np.float32))
@@ -230,21 +263,12 @@ def _default_body() -> Body:
         return _read_own(path)
 
 
-def _is_own_format(path: Path) -> bool:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return "pose_map" in file.files
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable npz ({error}); expected a body of ours or of SMPL format") from error
-
-
 def _read_own(path: Path) -> Body:
-    with np.load(path, allow_pickle=False) as file:
-        return body_from_arrays({key: file[key] for key in file.files})
+    return body_from_arrays(read_npz(path, "a body"))
 
 
 def _from_smpl(smpl: Any, name: str) -> Body:
-    """SMPL's arrays (Loper et al. 2015) in our terms: its 9(J-1) pose blendshapes are the pose directions themselves."""
+    """SMPL's arrays (Loper et al. 2015) in our terms: its 9(J-1) pose blendshapes are the pose directions."""
     vertices, joints = smpl.weights.shape
     pose_count = 9 * (joints - 1)
     regressor = smpl.joint_regressor
@@ -267,35 +291,34 @@ def _from_smpl(smpl: Any, name: str) -> Body:
     )
 
 
-def _check_arrays(body: Body) -> None:
-    vertex_count, joint_count = body.weights.shape
+def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
+    name = f"body '{arrays.get('name', '?')}'"
+    missing = [key for key in REQUIRED_ARRAYS if key not in arrays]
+    if missing:
+        raise ValueError(f"{name} lacks {', '.join(missing)}; it holds {', '.join(sorted(arrays))}")
+    vertex_count, joint_count = arrays["weights"].shape
+    shape_count, pose_count = len(arrays["shape_directions"]), len(arrays["pose_directions"])
     expected = {
         "template": (vertex_count, 3),
-        "shape_directions": (body.shape_directions.shape[0], vertex_count, 3),
-        "pose_directions": (body.pose_directions.shape[0], vertex_count, 3),
-        "pose_map": (9 * (joint_count - 1), body.pose_directions.shape[0]),
+        "shape_directions": (shape_count, vertex_count, 3),
+        "pose_directions": (pose_count, vertex_count, 3),
+        "pose_map": (9 * (joint_count - 1), pose_count),
         "joint_template": (joint_count, 3),
-        "joint_directions": (body.shape_directions.shape[0], joint_count, 3),
+        "joint_directions": (shape_count, joint_count, 3),
+        "parents": (joint_count,),
+        "joint_names": (joint_count,),
     }
     for key, shape in expected.items():
-        tensor: Tensor = getattr(body, key)
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"body '{body.name}': {key} has shape {tuple(tensor.shape)}, expected {shape}")
-        if not torch.isfinite(tensor).all():
-            raise ValueError(f"body '{body.name}': {key} holds NaN or infinity; the file is damaged")
-    if len(body.parents) != joint_count or len(body.joint_names) != joint_count:
-        raise ValueError(
-            f"body '{body.name}': {len(body.parents)} parents and {len(body.joint_names)} names for {joint_count} joints"
-        )
-    if any(parent >= joint for joint, parent in enumerate(body.parents)):
-        raise ValueError(f"body '{body.name}': a joint comes before its parent; sort the joints root first")
-    if int(body.faces.max()) >= vertex_count or int(body.faces.min()) < 0:
-        raise ValueError(
-            f"body '{body.name}': faces index vertex {int(body.faces.max())}, but the mesh has {vertex_count} vertices"
-        )
-    sums = body.weights.sum(dim=1)
-    if not torch.allclose(sums, torch.ones_like(sums), atol=1e-3):
-        raise ValueError(
-            f"body '{body.name}': skinning weights of vertex {int((sums - 1).abs().argmax())} sum to "
-            f"{float(sums[(sums - 1).abs().argmax()]):.3f}, expected 1"
-        )
+        if arrays[key].shape != shape:
+            raise ValueError(f"{name}: {key} has shape {arrays[key].shape}, expected {shape}")
+        if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
+            raise ValueError(f"{name}: {key} holds NaN or infinity; the file is damaged")
+    if any(parent >= joint for joint, parent in enumerate(arrays["parents"])):
+        raise ValueError(f"{name}: a joint comes before its parent; sort the joints root first")
+    faces = arrays["faces"]
+    if faces.max() >= vertex_count or faces.min() < 0:
+        raise ValueError(f"{name}: faces index vertex {faces.max()}, but the mesh has {vertex_count} vertices")
+    sums = arrays["weights"].sum(axis=1)
+    worst = int(np.abs(sums - 1).argmax())
+    if abs(sums[worst] - 1) > 1e-3:
+        raise ValueError(f"{name}: skinning weights of vertex {worst} sum to {sums[worst]:.3f}, expected 1")

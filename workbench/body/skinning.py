@@ -1,4 +1,4 @@
-"""Eq. 2: the skinning function W.  rest points, weights, joint rotations -> posed points, by linear or dual-quaternion blending."""
+"""Eq. 2: the skinning function W, linear or by dual quaternions.  rest points, weights, joint rotations -> posed points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,9 +83,7 @@ def dual_quaternion(
     return (quaternion_to_matrix(blended_real) @ points[..., None])[..., 0] + moved
 
 
-def _signed_weights(
-    weights: Float[Tensor, "*W N J"], quaternions: Float[Tensor, "*B J 4"]
-) -> Float[Tensor, "*B N J"]:
+def _signed_weights(weights: Float[Tensor, "*W N J"], quaternions: Float[Tensor, "*B J 4"]) -> Float[Tensor, "*B N J"]:
     pivot = weights.argmax(dim=-1)
     alignment = quaternions @ quaternions.mT
     if weights.dim() == 2:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RestTriangles:
-    """The material of a mesh: for each triangle the inverse of its flat rest edges, and its rest area (square metres)."""
+    """The material of a mesh: the inverse of each triangle's flat rest edges, and its rest area (square metres)."""
 
     faces: Int[Tensor, "M 3"]
     inverse_edges: Float[Tensor, "M 2 2"]

@@ -1,0 +1,277 @@
+"""Eq. 9-12: simulated garments to canonical space.  M_G (T,N,3), beta, theta -> X (T,N,3), M_G(X, beta, theta) = M_G.
+
+Two steps.  Fixed-point unskinning, X <- X + A(X)^-1 (M_G - M_G(X)), starts at the frame before and solves the data term
+almost everywhere.  What it leaves (vertices where space folds, or inside the body) is mended by minimising Eq. 9.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from workbench.collisions.body_sdf import BodySDF
+
+from workbench.body.skinning import blended_affine
+from workbench.collisions.garment_model import BodyState, GarmentModel, offsets
+from workbench.geometry.strain import RestTriangles, deformation_gradient, green_strain
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class ProjectionConfig:
+    """The paper leaves all of these open; ours, measured by `workbench evaluate projection`."""
+
+    fixed_point_steps: int = 12  # facts: tenfold contraction a step; the last few are for the folds
+    tolerance: float = 2e-5  # metres of re-posing error at which a vertex rests
+    mended_error: float = 1e-4  # metres; vertices above it go to the optimisation
+    strain_weight: float = 1e-6  # omega_1 of Eq. 9: strain 0.5 weighs as much as 0.5 mm
+    collision_weight: float = 4e-3  # omega_2 of Eq. 9: worth up to 2 mm of re-posing error
+    clearance: float = 1e-3  # epsilon of Eq. 12, metres
+    mend_rings: int = 2  # vertices around the bad ones that may move along
+    mend_steps: int = 60
+    mend_rate: float = 5e-4  # metres a step at the start
+    frames_at_once: int = 32
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Canonical garments and how well they return."""
+
+    canonical: Float[Tensor, "T N 3"]
+    error: Float[Tensor, "T N"]  # |M_G - M_G(X)|, metres
+    mended: Bool[Tensor, "T N"]  # where Eq. 9's optimisation had its say
+
+
+@dataclass(frozen=True)
+class Energy:
+    """The three terms of Eq. 9, summed over a garment."""
+
+    rec: Float[Tensor, ""]
+    strain: Float[Tensor, ""]
+    collision: Float[Tensor, ""]
+
+    def total(self, config: ProjectionConfig) -> Float[Tensor, ""]:
+        """Eq. 9"""
+        return self.rec + config.strain_weight * self.strain + config.collision_weight * self.collision
+
+
+def reconstruction_energy(target: Float[Tensor, "*B N 3"], posed: Float[Tensor, "*B N 3"]) -> Float[Tensor, ""]:
+    """|| M_G - M_G(X, beta, theta) ||^2      (Eq. 10), square metres"""
+    return (target - posed).square().sum()
+
+
+def strain_energy(unposed: Float[Tensor, "*B N 3"], rest: RestTriangles) -> Float[Tensor, ""]:
+    """|| 1/2 (F(T_G)^T F(T_G) - I) ||^2      (Eq. 11)"""
+    return green_strain(deformation_gradient(unposed, rest)).square().sum()
+
+
+def collision_energy(signed_distance: Float[Tensor, "*B N"], clearance: float) -> Float[Tensor, ""]:
+    """max(epsilon - SDF(X), 0)      (Eq. 12), metres"""
+    return (clearance - signed_distance).clamp_min(0.0).sum()
+
+
+@dataclass(frozen=True)
+class Projector:
+    """Projects sequences of one garment: `Projector(model, sdf, rest, template).project(garment, state)`."""
+
+    model: GarmentModel
+    sdf: BodySDF
+    rest: RestTriangles  # the garment's material, for Eq. 11
+    template: Float[Tensor, "N 3"]  # start of the first frame
+    config: ProjectionConfig = ProjectionConfig()
+
+    def project(
+        self,
+        garment: Float[Tensor, "T N 3"],
+        state: BodyState,
+        progress: Progress = lambda frames: None,
+    ) -> Projection:
+        """A simulated sequence with the body states that it was simulated on.
+
+        Errors: ValueError when the vertex count is not the template's, frames differ, or positions are not finite.
+        """
+        self._check(garment, state)
+        return self.mend(garment, state, self.unskin(garment, state, progress))
+
+    @torch.no_grad()
+    def unskin(
+        self, garment: Float[Tensor, "T N 3"], state: BodyState, progress: Progress = lambda frames: None
+    ) -> Projection:
+        """Fixed-point unskinning alone, each frame from the one before (the first from the template)."""
+        canonical, errors = torch.empty_like(garment), garment.new_empty(garment.shape[:-1])
+        start = self.template
+        for frame, target in enumerate(garment):
+            canonical[frame], errors[frame] = fixed_point(self.model, target, state[frame], start, self.config)
+            start = canonical[frame]
+            progress(1)
+        return Projection(canonical, errors, torch.zeros_like(errors, dtype=torch.bool))
+
+    def mend(self, garment: Float[Tensor, "T N 3"], state: BodyState, start: Projection) -> Projection:
+        """Minimise Eq. 9 over the vertices that unskinning left wrong or inside the body, and their neighbours.
+
+        A vertex takes its new place only with its whole patch, and a frame's energy never rises.
+        """
+        canonical, errors, mended = start.canonical.clone(), start.error.clone(), start.mended.clone()
+        for frames in _chunks(len(garment), self.config.frames_at_once):
+            bad = self._needs_mending(canonical[frames], errors[frames])
+            if not bool(bad.any()):
+                continue
+            patch = self._patch(bad)
+            moved, error = self._minimise(garment[frames], state[frames], canonical[frames], patch)
+            canonical[frames], errors[frames] = moved, torch.where(patch.free, error, errors[frames])
+            mended[frames] = patch.free
+        return replace(start, canonical=canonical, error=errors, mended=mended)
+
+    @torch.no_grad()
+    def energy(self, garment: Float[Tensor, "N 3"], state: BodyState, X: Float[Tensor, "N 3"]) -> Energy:
+        """The terms of Eq. 9 for one frame, over the whole garment."""
+        local = self.model.local_map(X, state)
+        return Energy(
+            reconstruction_energy(garment, local.posed(X)),
+            strain_energy(local.unposed(X), self.rest),
+            collision_energy(self.sdf(X), self.config.clearance),
+        )
+
+    @torch.no_grad()
+    def _needs_mending(self, X: Float[Tensor, "T N 3"], error: Float[Tensor, "T N"]) -> Bool[Tensor, "T N"]:
+        return (error > self.config.mended_error) | (self.sdf(X) < 0)
+
+    def _patch(self, bad: Bool[Tensor, "T N"]) -> "_Patch":
+        free = bad
+        for _ in range(self.config.mend_rings):
+            free = _dilated(free, self.rest.faces)
+        held = _dilated(free, self.rest.faces)
+        frame, vertex = held.nonzero(as_tuple=True)
+        slot = torch.full(held.shape, -1, dtype=torch.long)
+        slot[frame, vertex] = torch.arange(len(frame))
+        corners = slot[:, self.rest.faces]
+        inside = (corners >= 0).all(dim=-1) & free[:, self.rest.faces].any(dim=-1)
+        which = inside.nonzero()[:, 1]
+        triangles = RestTriangles(corners[inside], self.rest.inverse_edges[which], self.rest.area[which])
+        return _Patch(free, frame, vertex, free[frame, vertex], triangles)
+
+    def _minimise(
+        self, garment: Float[Tensor, "T N 3"], state: BodyState, start: Float[Tensor, "T N 3"], patch: "_Patch"
+    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N"]]:
+        config = self.config
+        target, first = garment[patch.frame, patch.vertex], start[patch.frame, patch.vertex]
+        step = torch.zeros_like(first, requires_grad=True)
+        optimiser = torch.optim.Adam([step], lr=config.mend_rate)
+        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.mend_steps)
+        free = patch.moves[:, None]
+
+        def terms(X: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Tensor]:
+            unposed, posed = self._posed_patch(X, state, patch.frame)
+            strain = green_strain(deformation_gradient(unposed, patch.triangles)).square().sum(dim=(-1, -2))
+            gap = (config.clearance - self.sdf(X)).clamp_min(0.0)
+            return (target - posed).square().sum(dim=-1), strain, gap
+
+        def frame_energy(rec: Tensor, strain: Tensor, gap: Tensor) -> Float[Tensor, "T"]:
+            total = torch.zeros(len(garment), dtype=rec.dtype)
+            total = total.index_add(0, patch.frame, rec + config.collision_weight * gap)
+            return total.index_add(0, patch.frame[patch.triangles.faces[:, 0]], config.strain_weight * strain)
+
+        with torch.no_grad():
+            before = frame_energy(*terms(first))
+        for _ in range(config.mend_steps):
+            rec, strain, gap = terms(first + step * free)
+            loss = rec.sum() + config.strain_weight * strain.sum() + config.collision_weight * gap.sum()  # Eq. 9
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            decay.step()
+        with torch.no_grad():
+            last = first + step * free
+            after = frame_energy(*terms(last))
+            X = torch.where((after < before)[patch.frame, None], last, first)
+            _, posed = self._posed_patch(X, state, patch.frame)
+            canonical = start.clone()
+            canonical[patch.frame, patch.vertex] = X
+            error = torch.zeros(garment.shape[:-1])
+            error[patch.frame, patch.vertex] = (target - posed).norm(dim=-1)
+        return canonical, error
+
+    def _posed_patch(
+        self, X: Float[Tensor, "P 3"], state: BodyState, frame: Int[Tensor, "P"]
+    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        """T_G and M_G of loose points, each in its own frame."""
+        values = self.model.fields.at(X)
+        single = replace(
+            values,
+            weights=values.weights[:, None],
+            shape_directions=values.shape_directions[:, None],
+            pose_directions=values.pose_directions[:, None],
+        )
+        own = state[frame]
+        rotation, translation = blended_affine(single.weights, own.transforms)
+        unposed = X + offsets(single, own)[:, 0]
+        return unposed, (rotation[:, 0] @ unposed[..., None])[..., 0] + translation[:, 0]
+
+    def _check(self, garment: Tensor, state: BodyState) -> None:
+        if garment.shape[-2] != len(self.template):
+            raise ValueError(
+                f"the sequence has {garment.shape[-2]} garment vertices, but the template has {len(self.template)}; "
+                "project it with the garment that it was simulated with"
+            )
+        if len(garment) != len(state.betas):
+            raise ValueError(
+                f"{len(garment)} garment frames, but {len(state.betas)} body frames; cut both to one length"
+            )
+        broken = ~torch.isfinite(garment).all(dim=-1).all(dim=-1)
+        if bool(broken.any()):
+            raise ValueError(
+                f"garment frame {int(broken.nonzero()[0])} holds NaN or infinity ({int(broken.sum())} such frames); "
+                "drop the frames where the simulation diverged"
+            )
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """Loose (frame, vertex) pairs: those that may move, and a ring around them that holds still."""
+
+    free: Bool[Tensor, "T N"]
+    frame: Int[Tensor, "P"]
+    vertex: Int[Tensor, "P"]
+    moves: Bool[Tensor, "P"]
+    triangles: RestTriangles  # faces index the pairs
+
+
+@torch.no_grad()
+def fixed_point(
+    model: GarmentModel,
+    target: Float[Tensor, "N 3"],
+    state: BodyState,
+    start: Float[Tensor, "N 3"],
+    config: ProjectionConfig,
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """X <- X + A(X)^-1 (M_G - M_G(X)) until a vertex is within tolerance; each vertex keeps the best X it has seen."""
+    X, best = start.clone(), torch.full(start.shape[:-1], torch.inf, dtype=start.dtype)
+    trial, active = start.clone(), torch.arange(len(start))
+    for _ in range(config.fixed_point_steps):
+        local = model.local_map(trial, state)
+        residual = target[active] - local.posed(trial)
+        error = residual.norm(dim=-1)
+        better = error < best[active]
+        X[active[better]], best[active[better]] = trial[better], error[better]
+        going = error > config.tolerance
+        if not bool(going.any()):
+            break
+        trial = (trial + local.pulled_back(residual))[going]
+        active = active[going]
+    return X, best
+
+
+def _dilated(mask: Bool[Tensor, "T N"], faces: Int[Tensor, "M 3"]) -> Bool[Tensor, "T N"]:
+    """The mask and every vertex that shares a face with it."""
+    touched = mask[:, faces].any(dim=-1)
+    frame, face = touched.nonzero(as_tuple=True)
+    grown = mask.clone()
+    for corner in range(3):
+        grown[frame, faces[face, corner]] = True
+    return grown
+
+
+def _chunks(length: int, size: int) -> Iterator[slice]:
+    return (slice(begin, min(begin + size, length)) for begin in range(0, length, size))
