@@ -182,7 +182,7 @@ def _drift(blendshapes: np.ndarray, template: np.ndarray, joint_blendshapes: np.
 
 
 def canonical_body(model: Any, population: Population, space: ShapeSpace) -> Body:
-    """The body in the A45 rest, exactly linear in beta: skinning by fixed rotations is linear in vertices and joints."""
+    """The body in the A45 rest, exactly linear in beta: skinning by fixed rotations is linear in the vertices."""
     drift = _drift(population.body_blendshapes, population.body_template, population.joint_blendshapes)
     joint_template = population.joint_template + np.tensordot(space.mean, population.joint_blendshapes, 1)
     template = population.body_template + np.tensordot(space.mean, population.body_blendshapes, 1)

@@ -91,9 +91,8 @@ def test_linear_blending_is_the_blended_affine_map(chain):
     joints, rotations, points, weights = chain
     transforms = forward_kinematics(rotations, joints, PARENTS).transforms
     rotation, translation = blended_affine(weights, transforms)
-    by_hand = sum(
-        weights[:, j, None] * (points @ transforms.rotation[j].mT + transforms.translation[j]) for j in range(4)
-    )
+    by_joint = [points @ transforms.rotation[j].mT + transforms.translation[j] for j in range(4)]
+    by_hand = (weights.mT[..., None] * torch.stack(by_joint)).sum(dim=0)
     assert torch.allclose((rotation @ points[..., None])[..., 0] + translation, by_hand)
 
 

@@ -273,7 +273,7 @@ def _from_smpl(smpl: Any, name: str) -> Body:
     pose_count = 9 * (joints - 1)
     regressor = smpl.joint_regressor
     shape_directions = np.moveaxis(smpl.shape_directions, -1, 0)
-    names = SMPL_JOINTS[:joints] + [f"joint_{index}" for index in range(len(SMPL_JOINTS), joints)]
+    names = [*SMPL_JOINTS[:joints]] + [f"joint_{index}" for index in range(len(SMPL_JOINTS), joints)]
     return body_from_arrays(
         {
             "name": np.array(name),

@@ -1,4 +1,4 @@
-"""Eq. 2: the skinning function W, linear or by dual quaternions.  rest points, weights, joint rotations -> posed points."""
+"""Eq. 2: the skinning function W, linear or by dual quaternions.  points, weights, joint rotations -> posed points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
