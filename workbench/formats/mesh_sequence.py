@@ -6,7 +6,7 @@ Frames are ours (metres, z up) and are written as they are: a reader of the file
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,12 +116,9 @@ def _read_ply(path: Path) -> Mesh:
 
 def _obj_bytes(mesh: Mesh) -> bytes:
     # nine digits return every float32 exactly
-    vertices = "".join("v %.9g %.9g %.9g\n" % tuple(row) for row in mesh.vertices.tolist())
-    return (vertices + _obj_faces(mesh.faces)).encode()
-
-
-def _obj_faces(faces: ndarray) -> str:
-    return "".join("f %d %d %d\n" % tuple(row) for row in (faces + 1).tolist())
+    vertices = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in mesh.vertices.tolist())
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + 1).tolist())
+    return (vertices + faces).encode()
 
 
 def _ply_bytes(mesh: Mesh) -> bytes:
@@ -301,9 +298,5 @@ def _check_mesh(path: Path, vertices: ndarray, faces: ndarray) -> None:
     if not np.isfinite(vertices).all():
         raise ValueError(f"{path} holds NaN or infinite coordinates")
     if faces.min() < 0 or faces.max() >= count:
-        raise ValueError(f"{path}: faces index vertex {_worst(faces, count)}, but the mesh has {count} vertices")
-
-
-def _worst(faces: Iterable | ndarray, count: int) -> int:
-    faces = np.asarray(faces)
-    return int(faces.max() if faces.max() >= count else faces.min())
+        worst = int(faces.max() if faces.max() >= count else faces.min())
+        raise ValueError(f"{path}: faces index vertex {worst}, but the mesh has {count} vertices")
