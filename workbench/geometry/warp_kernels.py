@@ -94,3 +94,32 @@ def winding_verdict(
         if above_high.sign < 0.0:
             result = int(1)  # noqa: UP018
     verdict[i] = result
+
+
+@wp.kernel
+def gaussian_neighbours(
+    mesh: wp.uint64,
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    order: wp.array(dtype=wp.int32),
+    directions: wp.array(dtype=wp.vec3),
+    least_sigma: float,
+    face: wp.array2d(dtype=wp.int32),
+    barycentric: wp.array2d(dtype=wp.vec3),
+    surface_face: wp.array(dtype=wp.int32),
+    surface_barycentric: wp.array(dtype=wp.vec3),
+    away: wp.array(dtype=wp.vec3),
+):
+    """phi(q_n) for q_n = p + sigma g_n with sigma = max(d, least_sigma) (Eq. 4-6), and phi(p), p - phi(p) beside."""
+    i = order[start + wp.tid()]
+    p = points[i]
+    own = wp.mesh_query_point_no_sign(mesh, p, 1.0e6)
+    offset = p - wp.mesh_eval_position(mesh, own.face, own.u, own.v)
+    surface_face[i] = own.face
+    surface_barycentric[i] = wp.vec3(own.u, own.v, 1.0 - own.u - own.v)
+    away[i] = offset
+    sigma = wp.max(wp.length(offset), least_sigma)
+    for n in range(directions.shape[0]):
+        hit = wp.mesh_query_point_no_sign(mesh, p + sigma * directions[n], 1.0e6)
+        face[i, n] = hit.face
+        barycentric[i, n] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)

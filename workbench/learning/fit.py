@@ -1,0 +1,154 @@
+"""The one optimisation loop: parameters, a loss a step -> trained parameters, a checkpoint that resumes to the same result.
+
+A run that is killed continues from its checkpoint with the same parameters, Adam moments, step and generator state, so it
+ends where the uninterrupted run ends (bit by bit on one thread).
+"""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+from tqdm import tqdm
+
+from workbench.store import atomic_write
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Adam with a cosine from `learning_rate` to `last_rate`.
+
+    Defaults are ours (the paper names no optimiser; facts.md 1: nearest documented values Adam 1e-3 to 5e-4, clip 5).
+    """
+
+    steps: int = 5000
+    learning_rate: float = 1e-3
+    last_rate: float = 1e-5  # reached at the last step, along a cosine
+    warmup: int = 100  # steps of linear rise to learning_rate
+    clip_norm: float = 5.0
+    checkpoint_every: int = 250  # steps
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a run reports: the step it stood at when it began (0 unless resumed), steps done in all, mean loss of the last
+    tenth of the steps it ran itself."""
+
+    resumed_at: int
+    steps: int
+    loss: float
+
+
+def learning_rate_at(step: int, config: FitConfig) -> float:
+    """Linear warm-up, then half a cosine from learning_rate to last_rate."""
+    if step < config.warmup:
+        return config.learning_rate * (step + 1) / config.warmup
+    progress = (step - config.warmup) / max(1, config.steps - 1 - config.warmup)
+    fall = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+    return config.last_rate + (config.learning_rate - config.last_rate) * fall
+
+
+def fit(
+    parameters: Sequence[Tensor],
+    loss_of: Callable[[int, torch.Generator], Tensor],
+    config: FitConfig,
+    *,
+    generator: torch.Generator,
+    checkpoint: Path | None = None,
+    label: str = "fit",
+    watch: Callable[[int, float], None] | None = None,
+) -> FitResult:
+    """Minimise `loss_of(step, generator)` over `parameters`, in place.
+
+    All chance of a step must come from `generator`, or a resumed run differs.  `checkpoint` (safetensors) is written every
+    `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.  `watch(step,
+    loss)` is called after each step (logging).  Raises ValueError for a checkpoint of other parameters or another config,
+    FloatingPointError when the loss is not finite.
+    """
+    parameters = list(parameters)
+    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+    start = 0
+    if checkpoint is not None and checkpoint.exists():
+        start = _restore(checkpoint, parameters, optimizer, generator, config)
+    losses: list[float] = []
+    with tqdm(range(start, config.steps), initial=start, total=config.steps, desc=label, mininterval=5.0) as bar:
+        for step in bar:
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate_at(step, config)
+            optimizer.zero_grad(set_to_none=True)
+            loss = loss_of(step, generator)
+            value = loss.item()
+            if not math.isfinite(value):
+                raise FloatingPointError(f"{label}: the loss is {value} at step {step}; lower the learning rate")
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(parameters, config.clip_norm)
+            optimizer.step()
+            losses.append(value)
+            bar.set_postfix(loss=f"{value:.3g}", refresh=False)
+            if watch is not None:
+                watch(step, value)
+            done = step + 1
+            if checkpoint is not None and (done % config.checkpoint_every == 0 or done == config.steps):
+                _save(checkpoint, parameters, optimizer, generator, config, done)
+    tail = losses[-max(1, config.steps // 10) :]
+    return FitResult(resumed_at=start, steps=config.steps, loss=sum(tail) / len(tail) if tail else math.nan)
+
+
+def _save(
+    path: Path,
+    parameters: Sequence[Tensor],
+    optimizer: torch.optim.Adam,
+    generator: torch.Generator,
+    config: FitConfig,
+    step: int,
+) -> None:
+    tensors = {"generator": generator.get_state()}
+    for index, parameter in enumerate(parameters):
+        state = optimizer.state[parameter]
+        tensors[f"parameter.{index}"] = parameter.detach().contiguous()
+        tensors[f"mean.{index}"] = state["exp_avg"].contiguous()
+        tensors[f"square.{index}"] = state["exp_avg_sq"].contiguous()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"step": str(step), "config": json.dumps(asdict(config), sort_keys=True)}
+    with atomic_write(path) as part:
+        save_file(tensors, part, metadata=metadata)
+
+
+def _restore(
+    path: Path,
+    parameters: Sequence[Tensor],
+    optimizer: torch.optim.Adam,
+    generator: torch.Generator,
+    config: FitConfig,
+) -> int:
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  not a dict
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"checkpoint {path} is unreadable ({error}); delete it to start anew") from error
+    expected = json.dumps(asdict(config), sort_keys=True)
+    if metadata.get("config") != expected:
+        raise ValueError(
+            f"checkpoint {path} belongs to another run: its config is {metadata.get('config')}, this one's {expected}; "
+            "delete it or choose another path"
+        )
+    shapes = [tuple(p.shape) for p in parameters]
+    saved = [tuple(tensors[f"parameter.{i}"].shape) for i in range(len(tensors)) if f"parameter.{i}" in tensors]
+    if saved != shapes:
+        raise ValueError(f"checkpoint {path} holds parameters of shapes {saved}, expected {shapes}")
+    step = int(metadata["step"])
+    for index, parameter in enumerate(parameters):
+        parameter.data.copy_(tensors[f"parameter.{index}"])
+        optimizer.state[parameter] = {
+            "step": torch.tensor(float(step)),
+            "exp_avg": tensors[f"mean.{index}"],
+            "exp_avg_sq": tensors[f"square.{index}"],
+        }
+    generator.set_state(tensors["generator"])
+    return step
