@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from workbench.collisions.body_sdf import BodySDF
 
 from workbench.body.skinning import blended_affine
+from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.garment_model import BodyState, GarmentModel, offsets
 from workbench.geometry.strain import RestTriangles, deformation_gradient, green_strain
 

@@ -1,0 +1,222 @@
+"""`workbench evaluate projection`: Fig. 3 in figures.  simulated sequences, motions -> rows (ours, baselines, the floor)."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from workbench.body.model import Body
+from workbench.collisions.body_sdf import GridSDF
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import BodyState, GarmentModel
+from workbench.collisions.penetration import penetration
+from workbench.collisions.projection import Projection, ProjectionConfig, Projector
+from workbench.collisions.projection_baselines import constant_weights, nearest_weights
+from workbench.collisions.sequences import SimulatedSequence, shipped_sequences
+from workbench.collisions.unprojection_floor import REGIONS, Floor, static_template_floor, with_arms_spread
+from workbench.evaluation_table import Row, at_least, at_most, told
+from workbench.formats import load_motion, motion_files
+from workbench.garments import Garment
+from workbench.geometry.strain import rest_triangles
+from workbench.motion import Motion
+
+MILLI = 1e3
+PERCENT = 100.0
+SPREAD = 15.0  # degrees: what the published preprocessing does to every motion
+
+
+@dataclass(frozen=True)
+class ProjectionEvaluation:
+    """Projection of simulated sequences, its two baselines, what each term buys, and the floor of unprojection."""
+
+    sequences: Path | None = None  # folder of simulated sequences (.npz); default: those that ship
+    motions: Path | None = None  # folder of motion files for the floor; default: those that ship
+    floor_shapes: int = 3  # random shapes, each with every motion
+    floor_frames: int = 90  # frames of each motion
+    seed: int = 0
+    projection: ProjectionConfig = ProjectionConfig()
+
+
+@dataclass(frozen=True)
+class Canonical:
+    """One way of unposing, over all kept frames of all sequences."""
+
+    inside: float  # share of vertices inside the canonical body where the simulation is clean
+    jitter: float  # mean |X[t+1] - 2 X[t] + X[t-1]|, metres
+    error: Float[Tensor, "R"]  # re-posing error of every vertex, metres
+
+
+def rows(config: ProjectionEvaluation) -> list[Row]:
+    """Everything, in one run."""
+    body, fields, sdf = Body.default(), GridFields.default(), GridSDF.default()
+    model = GarmentModel(body, fields)
+    sequences = list(_sequences(config))
+    table: list[Row] = []
+    table += projection_rows(model, sdf, sequences, config.projection)
+    table += floor_rows(model, config)
+    return table
+
+
+def projection_rows(
+    model: GarmentModel, sdf: GridSDF, sequences: list[SimulatedSequence], config: ProjectionConfig
+) -> list[Row]:
+    """Ours against both baselines of Fig. 3, speed, and what each step and term buys."""
+    runs = [_Run.of(model, sdf, sequence, config) for sequence in sequences]
+    frames = sum(len(run.sequence) for run in runs)
+    start = time.perf_counter()
+    ours = [run.projector.project(run.garment, run.state) for run in runs]
+    rate = frames / (time.perf_counter() - start)
+    full = _measure(runs, [p.canonical for p in ours])
+    constant = _measure(runs, [constant_weights(model.body, r.template, r.garment, r.state) for r in runs])
+    nearest = _measure(runs, [nearest_weights(model.body, r.garment, r.state, r.bodies) for r in runs])
+    table = [
+        told("simulated frames projected", frames, "frames"),
+        at_most("re-posing error, mean", MILLI * float(full.error.mean()), "mm", 0.1),
+        at_most("re-posing error, p99", MILLI * float(full.error.quantile(0.99)), "mm", 1.0),
+        told("re-posing error, max", MILLI * float(full.error.max()), "mm"),
+        at_most("canonical vertices inside, clean simulation", PERCENT * full.inside, "%", 0.0),
+        told("baseline: constant weights, inside", PERCENT * constant.inside, "%"),
+        told("baseline: nearest weights, inside", PERCENT * nearest.inside, "%"),
+        _fewer(
+            "fewer inside than both baselines (best baseline - ours)", PERCENT, full.inside, constant, nearest, "inside"
+        ),
+        told("jitter (mean second difference), ours", MILLI * full.jitter, "mm"),
+        told("baseline: constant weights, jitter", MILLI * constant.jitter, "mm"),
+        told("baseline: nearest weights, jitter", MILLI * nearest.jitter, "mm"),
+        _fewer(
+            "less jitter than both baselines (best baseline - ours)", MILLI, full.jitter, constant, nearest, "jitter"
+        ),
+        told("baseline: constant weights, re-posing error mean", MILLI * float(constant.error.mean()), "mm"),
+        told("baseline: nearest weights, re-posing error mean", MILLI * float(nearest.error.mean()), "mm"),
+        at_least("speed, frames projected a second", rate, "frames/s", 30.0),
+    ]
+    return table + ablation_rows(runs, ours, config)
+
+
+def ablation_rows(runs: list["_Run"], ours: list[Projection], config: ProjectionConfig) -> list[Row]:
+    """What unskinning leaves, and what the data, strain and collision terms of Eq. 9 then buy."""
+    unskinned = [run.projector.unskin(run.garment, run.state) for run in runs]
+    variants: dict[str, Callable[[ProjectionConfig], ProjectionConfig]] = {
+        "Eq. 10 alone": lambda c: replace(c, strain_weight=0.0, collision_weight=0.0),
+        "Eq. 10 + 11 (no collision term)": lambda c: replace(c, collision_weight=0.0),
+        "Eq. 10 + 12 (no strain term)": lambda c: replace(c, strain_weight=0.0),
+    }
+    table = _variant_rows("unskinning only", runs, unskinned)
+    for name, change in variants.items():
+        mended = [
+            replace(run.projector, config=change(config)).mend(run.garment, run.state, start)
+            for run, start in zip(runs, unskinned, strict=True)
+        ]
+        table += _variant_rows(name, runs, mended)
+    table += _variant_rows("all of Eq. 9", runs, ours)
+    mended = torch.cat([p.mended.flatten() for p in ours]).float().mean()
+    return [*table, told("vertices that Eq. 9's optimisation moved", PERCENT * float(mended), "%")]
+
+
+def _variant_rows(name: str, runs: list["_Run"], projections: list[Projection]) -> list[Row]:
+    measured = _measure(runs, [p.canonical for p in projections])
+    return [
+        told(f"{name}: error p99.9", MILLI * float(measured.error.quantile(0.999)), "mm"),
+        told(f"{name}: error max", MILLI * float(measured.error.max()), "mm"),
+        told(f"{name}: inside", PERCENT * measured.inside, "%"),
+        told(f"{name}: jitter", MILLI * measured.jitter, "mm"),
+    ]
+
+
+def _fewer(metric: str, scale: float, ours: float, constant: Canonical, nearest: Canonical, figure: str) -> Row:
+    gap = scale * (min(getattr(constant, figure), getattr(nearest, figure)) - ours)
+    return Row(metric, gap, "%" if scale == PERCENT else "mm", "> 0", gap > 0)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A sequence made ready: kept frames, body states, posed bodies, the projector of its garment."""
+
+    sequence: SimulatedSequence
+    projector: Projector
+    template: Float[Tensor, "N 3"]
+    garment: Float[Tensor, "T N 3"]
+    state: BodyState
+    bodies: Float[Tensor, "T V 3"]
+    clean: Bool[Tensor, "T N"]  # vertices that the simulation keeps outside the body
+
+    @staticmethod
+    def of(model: GarmentModel, sdf: GridSDF, sequence: SimulatedSequence, config: ProjectionConfig) -> "_Run":
+        garment = Garment.load(sequence.garment_name)
+        kept = sequence.valid
+        positions = sequence.garment[kept]
+        state = model.state(sequence.rotations[kept], sequence.betas, sequence.translation[kept])
+        bodies = model.body.vertices(sequence.rotations[kept], sequence.betas, sequence.translation[kept])
+        projector = Projector(
+            model, sdf, rest_triangles(garment.rest_vertices, garment.faces), garment.vertices, config
+        )
+        clean = ~penetration(bodies, model.body.faces, positions).inside
+        return _Run(sequence, projector, garment.vertices, positions, state, bodies, clean)
+
+
+@torch.no_grad()
+def _measure(runs: list[_Run], canonical: list[Float[Tensor, "T N 3"]]) -> Canonical:
+    inside, clean, jitter, error = 0, 0, [], []
+    for run, X in zip(runs, canonical, strict=True):
+        model = run.projector.model
+        hit = penetration(model.body.template[None], model.body.faces, X).inside
+        inside += int((hit & run.clean).sum())
+        clean += int(run.clean.sum())
+        jitter.append((X[2:] - 2 * X[1:-1] + X[:-2]).norm(dim=-1).flatten())
+        error += [
+            (model.posed(X[frame], run.state[frame]) - target).norm(dim=-1) for frame, target in enumerate(run.garment)
+        ]
+    return Canonical(inside / clean, float(torch.cat(jitter).mean()), _sample(torch.cat(error)))
+
+
+def _sample(values: Float[Tensor, "R"], most: int = 10_000_000) -> Float[Tensor, "R"]:
+    """torch.quantile takes at most 16 million values: every k-th of a longer list."""
+    return values[:: 1 + len(values) // most]
+
+
+def floor_rows(model: GarmentModel, config: ProjectionEvaluation) -> list[Row]:
+    """facts.md 9: the static T-shirt through motions, raw, spread and cleared; by region; by skinning."""
+    generator = torch.Generator().manual_seed(config.seed)
+    betas = torch.randn(config.floor_shapes, model.body.shape_count, generator=generator).clamp(-2.5, 2.5)
+    motions = [motion.clip(0, min(len(motion), config.floor_frames)) for motion in _motions(config, model.body)]
+    template = Garment.load("tshirt").vertices
+    raw = [(motion, shape) for motion in motions for shape in betas]
+    spread = [(with_arms_spread(motion, torch.pi / 180 * SPREAD), shape) for motion, shape in raw]
+    cleared = [(motion.cleared(model.body, betas=shape), shape) for motion, shape in raw]
+    table = [told("floor: frames posed", sum(len(motion) for motion, _ in raw), "frames")]
+    for name, cases in (("raw", raw), (f"arms spread {SPREAD:.0f} degrees", spread), ("cleared", cleared)):
+        table += _floor_table(name, static_template_floor(model, template, cases))
+    dual = static_template_floor(model, template, cleared, dual_quaternions=True)
+    return table + _floor_table("cleared, dual quaternions", dual)
+
+
+def _floor_table(name: str, floor: Floor) -> list[Row]:
+    table = [
+        told(f"floor, {name}: static template inside", PERCENT * floor.share, "%"),
+        told(f"floor, {name}: of it where the body overlaps itself", PERCENT * floor.overlap_share, "%"),
+    ]
+    return table + [
+        told(f"floor, {name}: of the {region}' vertices", PERCENT * floor.region_share[region], "%")
+        for region in REGIONS
+        if region in floor.region_share
+    ]
+
+
+def _sequences(config: ProjectionEvaluation) -> Iterator[SimulatedSequence]:
+    if config.sequences is None:
+        yield from shipped_sequences()
+        return
+    files = sorted(config.sequences.glob("*.npz"))
+    if not files:
+        raise ValueError(
+            f"no simulated sequences (*.npz) in {config.sequences}; make some: python -m assets_gen simulations"
+        )
+    yield from (SimulatedSequence.load(file) for file in files)
+
+
+def _motions(config: ProjectionEvaluation, body: Body) -> Iterable[Motion]:
+    return [load_motion(file, body) for file in motion_files(config.motions)]
