@@ -758,7 +758,7 @@ def backwalk(rng: np.random.Generator, t: np.ndarray) -> Choreography:
 
 def jog(rng: np.random.Generator, t: np.ndarray) -> Choreography:
     speed = rng.uniform(1.8, 2.2)
-    gait = Gait(rate=1.4, duty=0.36, lift=0.26, push=40, strike=4, phase=rng.uniform(0, 1), width=0.07)
+    gait = Gait(rate=1.4, duty=0.36, lift=0.26, push=52, strike=4, phase=rng.uniform(0, 1), width=0.07)
     c = walking(rng, t, gait, arc(speed, rng.uniform(-6, 6)), swing=rng.uniform(28, 36), bend=rng.uniform(72, 88))
     beat = gait.rate * t + gait.phase - gait.duty / 2
     hop = -0.03 * np.cos(4 * np.pi * beat) - 0.03
