@@ -1,8 +1,6 @@
 """Motion: theta over time.  rotations (T,J,3,3), translation (T,3), fps  ->  resampled, clipped, cleared, on disk."""
 
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +14,7 @@ from torch import Tensor
 from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
 from workbench.geometry.rotations import matrix_to_quaternion, quaternion_to_matrix, slerp
+from workbench.npz import read_npz
 from workbench.store import atomic_write
 
 _FORMAT = "workbench-motion-1"
@@ -86,7 +85,7 @@ class Motion:
         stop = len(self) if stop is None else stop
         if not 0 <= start < stop <= len(self):
             raise ValueError(
-                f"a clip needs 0 <= start < stop <= {len(self)} (the number of frames), but got start {start}, stop {stop}"
+                f"a clip needs 0 <= start < stop <= {len(self)} (the frames), but got start {start}, stop {stop}"
             )
         return replace(self, rotations=self.rotations[start:stop], translation=self.translation[start:stop])
 
@@ -114,15 +113,9 @@ class Motion:
     @staticmethod
     def load(path: str | Path) -> "Motion":
         """Read what `save` wrote.  Raises ValueError naming the file and what is wrong with it."""
-        arrays = read_arrays(path)
+        arrays = read_npz(path, "a motion of this package (load_motion reads those of others)", required=_ARRAYS)
         if not is_own_motion(arrays):
-            raise ValueError(
-                f"{path} is not a motion of this package: it has no entry 'format' = {_FORMAT!r}; "
-                f"BVH and AMASS files are read by workbench.formats.load_motion"
-            )
-        missing = [key for key in _ARRAYS if key not in arrays]
-        if missing:
-            raise ValueError(f"{path} lacks {', '.join(missing)}: write the motion again with Motion.save")
+            raise ValueError(f"{path} is a motion of format {arrays['format']}, but this version reads {_FORMAT}")
         try:
             skeleton = Skeleton(
                 names=tuple(str(name) for name in arrays["joint_names"]),
@@ -146,24 +139,6 @@ class Motion:
 def is_own_motion(arrays: Mapping[str, np.ndarray]) -> bool:
     """Are these the arrays of a file that `Motion.save` wrote?"""
     return str(arrays.get("format")) == _FORMAT
-
-
-def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file, without unpickling.
-
-    Raises FileNotFoundError, or ValueError naming the file when it is truncated, no npz, or would need unpickling.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no motion file at {path}")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if isinstance(archive, np.ndarray):
-                raise ValueError("it holds one bare array (npy), not named ones")
-            return {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path} is no readable npz file (truncated, or another format): {reason}") from error
 
 
 def _check(motion: Motion) -> None:

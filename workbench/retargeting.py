@@ -1,14 +1,15 @@
-"""Retargeting: a motion of any known rig -> the same motion on another skeleton, in metres, z up, on the floor.
+"""Retargeting: a motion of any known rig -> the same motion on another skeleton, in metres, z up.
 
 For a joint of the target that has a counterpart in the source, with global rotations G relative to the two rests,
     G_target(t) = C_world G_source(t) C_rest^-1 A,
 C takes the source's axes to ours (z up, facing -y) and A takes the target's rest pose to the source's: the smallest
-rotation between the rest directions of a limb's bone, turned about it so that elbows and knees fold about the same axis.
+rotation between the rest directions of a limb's bone, turned about it so that elbows and knees fold about one axis.
 The spine, neck and clavicles are not aligned (A = I): their bones run differently in every rig, their flesh does not.
 A joint without counterpart keeps its rest rotation relative to its parent.
 """
 
 import logging
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,8 +19,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
-from workbench.body.skinning import forward_kinematics
+from workbench.body.skinning import forward_kinematics, linear_blend
 from workbench.geometry.rotations import axis_angle_to_matrix, rotation_angle, smallest_rotation
 from workbench.motion import Motion
 
@@ -32,6 +34,9 @@ Y_UP_FROM_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0
 
 _FORWARD = (0.0, -1.0, 0.0)
 
+_SAME_REST = math.radians(1.0)
+"""Bones of two rest poses that agree this well are in one and the same rest: there motion carries over unchanged."""
+
 
 @dataclass(frozen=True)
 class RetargetConfig:
@@ -42,9 +47,10 @@ class RetargetConfig:
     t_pose_arms, t_pose_legs: how near to the rest pose a frame counts as T-pose, in degrees; ours: the CMU conversions
     start with arms 5 and legs 17 degrees off.  t_pose_jump: the arms' speed in rad/s above which the frames after a
     T-pose still belong to the jump out of it; ours: people stay below 20.
-    on_floor: lift or lower the clip so that its lowest foot stands at z = 0.  floor_quantile: the share of frames that
-    may go below, so that one slip of the capture does not make the body float; ours: measured on four real clips.
     largest_twist: an elbow or knee axis further from the usual one than this is taken for noise, in degrees; ours.
+    planted_speed: a foot slower than this stands, in leg lengths a second; ours: half a centimetre a frame at 30 fps.
+    largest_slope: standing feet whose soles slope more than this are meant so (toe stand), in degrees; ours: the four
+    real clips slope by 1 to 7, an error of their rest poses.
     """
 
     world_up: Axis | None = None
@@ -52,9 +58,9 @@ class RetargetConfig:
     t_pose_arms: float = 10.0
     t_pose_legs: float = 25.0
     t_pose_jump: float = 20.0
-    on_floor: bool = True
-    floor_quantile: float = 0.1
     largest_twist: float = 60.0
+    planted_speed: float = 0.2
+    largest_slope: float = 15.0
 
 
 # Names: a role is a joint of the default rig (cmu_mb); a convention says what others call it, best name first.
@@ -83,7 +89,10 @@ def _sided(left: Mapping[str, str], from_left: Mapping[str, str]) -> dict[str, t
 CONVENTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "CMU / MotionBuilder": _sided(
         {
-            **{role: role for role in ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LHipJoint", "LThumb")},
+            **{
+                role: role
+                for role in ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LHipJoint", "LThumb")
+            },
             **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "ToeBase", "Shoulder", "FingerBase")},
             "LeftHandFinger1": "LeftHandFinger1 LFingers LeftHandIndex1",
         },
@@ -91,7 +100,12 @@ CONVENTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     ),
     "Mixamo": _sided(
         {
-            **{"Hips": "Hips", "LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2", "Neck": "Neck", "Head": "Head"},
+            "Hips": "Hips",
+            "LowerBack": "Spine",
+            "Spine": "Spine1",
+            "Spine1": "Spine2",
+            "Neck": "Neck",
+            "Head": "Head",
             **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "Shoulder")},
             "LeftToeBase": "LeftToeBase LeftToe",
             "LeftFingerBase": "LeftHandMiddle1",
@@ -160,7 +174,9 @@ def roles_of(skeleton: Skeleton, mapping: Mapping[str, str] | None = None) -> di
     joints = {_plain(name): j for j, name in reversed(list(enumerate(skeleton.names)))}
 
     def recognised(table: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
-        found = {role: next((joints[n.lower()] for n in names if n.lower() in joints), -1) for role, names in table.items()}
+        found = {
+            role: next((joints[n.lower()] for n in names if n.lower() in joints), -1) for role, names in table.items()
+        }
         return {role: j for role, j in found.items() if j >= 0}
 
     best_name, best = max(
@@ -170,9 +186,13 @@ def roles_of(skeleton: Skeleton, mapping: Mapping[str, str] | None = None) -> di
     roles = dict(best)
     for role, name in (mapping or {}).items():
         if role not in CONVENTIONS["CMU / MotionBuilder"]:
-            raise ValueError(f"mapping names the role {role!r}; roles are {', '.join(CONVENTIONS['CMU / MotionBuilder'])}")
+            raise ValueError(
+                f"mapping names the role {role!r}; roles are {', '.join(CONVENTIONS['CMU / MotionBuilder'])}"
+            )
         if name not in skeleton.names:
-            raise ValueError(f"mapping takes {role} from the joint {name!r}, but the motion has {', '.join(skeleton.names)}")
+            raise ValueError(
+                f"mapping takes {role} from the joint {name!r}, but the motion has {', '.join(skeleton.names)}"
+            )
         roles[role] = skeleton.index(name)
     missing = [role for role in REQUIRED_ROLES if role not in roles]
     if missing:
@@ -252,8 +272,23 @@ def _bone_direction(skeleton: Skeleton, roles: Mapping[str, int], role: str, nex
     return None
 
 
-def _heading(direction: Tensor) -> Tensor | None:
-    """The horizontal part of a direction; None for a vertical one."""
+def _both_directions(
+    target: Skeleton,
+    source: Skeleton,
+    target_roles: Mapping[str, int],
+    source_roles: Mapping[str, int],
+    role: str,
+    next_role: str,
+) -> tuple[Tensor | None, Tensor | None]:
+    return _bone_direction(target, target_roles, role, next_role), _bone_direction(
+        source, source_roles, role, next_role
+    )
+
+
+def _heading(direction: Tensor | None) -> Tensor | None:
+    """The horizontal part of a direction; None for a vertical one, or none at all."""
+    if direction is None:
+        return None
     flat = direction * direction.new_tensor([1.0, 1.0, 0.0])
     return flat if flat.norm() > 0.2 * direction.norm() else None
 
@@ -268,7 +303,7 @@ def _hinge_twist(
     """The angle about the bone that takes the target's folding axis onto the source's, in radians.
 
     bend (T,3,3): the source joint's rotation relative to the limb's first bone.  The source's axis is measured from the
-    motion: the mean of d x bend d over time; the target folds towards `fold`.  0 when it never folds, or about no one axis.
+    motion, the mean of d x bend d over time; the target folds towards `fold`.  0 when it never folds about one axis.
     """
     d = source_bone / source_bone.norm()
     folding = torch.linalg.cross(d.expand(len(bend), 3), bend @ d)
@@ -280,17 +315,54 @@ def _hinge_twist(
     return float(angle) if angle.abs() <= torch.deg2rad(torch.tensor(largest)) else 0.0
 
 
+def _planted(foot: Float[Tensor, "T 3"], ankle: Float[Tensor, "T 3"], speed: float) -> Bool[Tensor, "T"]:
+    """Frames in which a foot stands: both its joints slower than `speed` (a frame) and as low as they usually get."""
+    if len(foot) < 3:
+        return torch.zeros(len(foot), dtype=torch.bool)
+    moved = torch.stack([foot, ankle])
+    step = (moved[:, 1:] - moved[:, :-1]).norm(dim=-1).amax(0)
+    step = torch.maximum(torch.cat([step[:1], step]), torch.cat([step, step[-1:]]))
+    return (step < speed) & (foot[:, 2] < foot[:, 2].quantile(0.5))
+
+
+def _levelled(
+    bone: Tensor | None, world: Float[Tensor, "T 3 3"], planted: Bool[Tensor, "T"], config: RetargetConfig
+) -> Float[Tensor, "3 3"]:
+    """The pitch that undoes how much steeper the foot's bone rises when it stands than in its rest pose (median).
+
+    The identity when the foot hardly ever stands, has no one slope then, or one too large to be the rest pose's error.
+    """
+    level = torch.eye(3, dtype=torch.float64)
+    heading = _heading(bone)
+    if bone is None or heading is None or planted.sum() < 10:
+        return level
+
+    def rise(direction: Tensor) -> Tensor:
+        return torch.atan2(direction[..., 2], direction[..., :2].norm(dim=-1))
+
+    slope = rise(world[planted] @ bone) - rise(bone)
+    low, middle, high = slope.quantile(slope.new_tensor([0.25, 0.5, 0.75])).tolist()
+    largest = math.radians(config.largest_slope)
+    if high - low > largest or abs(middle) > largest:
+        return level
+    upward = torch.linalg.cross(heading / heading.norm(), heading.new_tensor([0.0, 0.0, 1.0]))
+    return axis_angle_to_matrix(-middle * upward)
+
+
 def rest_alignment(
     source: Skeleton,
     target: Skeleton,
     source_roles: Mapping[str, int],
     target_roles: Mapping[str, int],
     source_world: Float[Tensor, "T J 3 3"],
+    source_places: Float[Tensor, "T J 3"],
+    fps: float,
     config: RetargetConfig,
 ) -> dict[str, Float[Tensor, "3 3"]]:
     """A of each limb's role: from the target's rest to the source's, both z up and facing -y.
 
-    source_world (T,J,3,3): the source's global rotations, in the same axes; elbows and knees are measured from them.
+    source_world (T,J,3,3), source_places (T,J,3): the source's global rotations and joints, in the same axes; how
+    elbows and knees fold and how feet stand is measured from them.
     """
     backward, forward = -torch.tensor(_FORWARD, dtype=torch.float64), torch.tensor(_FORWARD, dtype=torch.float64)
     A: dict[str, Tensor] = {}
@@ -299,32 +371,45 @@ def rest_alignment(
             first, second, third = (side + part for part in chain[:3])
             bones = []
             for role, next_role in ((first, second), (second, third)):
-                pair = [_bone_direction(s, r, role, next_role) for s, r in ((target, target_roles), (source, source_roles))]
+                pair = _both_directions(target, source, target_roles, source_roles, role, next_role)
                 if pair[0] is None or pair[1] is None:
                     which = "source" if pair[1] is None else "target"
                     raise ValueError(f"in the {which}'s rest pose the bone from {role} to {next_role} has no length")
                 bones.append(pair)
             swings = [smallest_rotation(t, s) for t, s in bones]
             twist = 0.0
-            # Two rests that agree to a degree are one rest: there motion carries over unchanged.
-            if max(float(rotation_angle(swing)) for swing in swings) > 0.0175:
+            if max(float(rotation_angle(swing)) for swing in swings) > _SAME_REST:
                 bend = source_world[:, source_roles[first]].mT @ source_world[:, source_roles[second]]
                 twist = _hinge_twist(bend, bones[1][1], bones[1][0], fold, config.largest_twist)
             for role, (_, s), swing in zip((first, second), bones, swings):
                 A[role] = axis_angle_to_matrix(twist * s / s.norm()) @ swing
             if len(chain) == 4:  # a hand continues its forearm
-                ends = [
-                    _bone_direction(s, r, third, side + chain[3]) for s, r in ((target, target_roles), (source, source_roles))
-                ]
-                known = ends[0] is not None and ends[1] is not None
-                A[third] = smallest_rotation(ends[0], ends[1]) if known else A[second]
-        # Soles are flat on the floor in every rest pose, at whatever slope the ankle-to-toe bone runs: align the heading.
+                t, s = _both_directions(target, source, target_roles, source_roles, third, side + chain[3])
+                A[third] = A[second] if t is None or s is None else smallest_rotation(t, s)
+        # Soles are flat on the floor in every rest pose, at whatever slope the ankle-to-toe bone runs: align only its
+        # heading, then take off the slope with which the source's foot stands.
         foot, toe = side + "Foot", side + "ToeBase"
-        ends = [_bone_direction(s, r, foot, toe) for s, r in ((target, target_roles), (source, source_roles))]
-        flat = [None if end is None else _heading(end) for end in ends]
-        known = flat[0] is not None and flat[1] is not None
-        A[foot] = smallest_rotation(flat[0], flat[1]) if known else torch.eye(3, dtype=torch.float64)
-        A[toe] = A[foot]
+        target_foot, source_foot = _both_directions(target, source, target_roles, source_roles, foot, toe)
+        heading, source_heading = _heading(target_foot), _heading(source_foot)
+        yaw = torch.eye(3, dtype=torch.float64)
+        if heading is not None and source_heading is not None:
+            yaw = smallest_rotation(heading, source_heading)
+        A[foot] = A[toe] = yaw
+        if (
+            target_foot is not None
+            and source_foot is not None
+            and _angle_between(target_foot, source_foot) < _SAME_REST
+        ):
+            continue
+        ankle = source_roles[foot]
+        ball = source_roles.get(toe, ankle)
+        speed = config.planted_speed * _leg_length(source, source_roles) / fps
+        planted = _planted(source_places[:, ball], source_places[:, ankle], speed)
+        A[foot] = A[toe] = _levelled(source_foot, source_world[:, ankle], planted, config) @ yaw
+        if toe in source_roles:
+            source_toe = _bone_direction(source, source_roles, toe, "")
+            if source_toe is not None:
+                A[toe] = _levelled(source_toe, source_world[:, ball], planted, config) @ yaw
         for finger in ("FingerBase", "HandFinger1"):
             A[side + finger] = A[side + "Hand"]
         A[side[0] + "Thumb"] = A[side + "Hand"]
@@ -379,23 +464,19 @@ def _angle_between(a: Float[Tensor, "*#B 3"], b: Float[Tensor, "*#B 3"]) -> Floa
 # The floor
 
 
-def sole_heights(
-    skeleton: Skeleton, roles: Mapping[str, int], rotation: Float[Tensor, "T J 3 3"], joints: Float[Tensor, "T J 3"]
-) -> Float[Tensor, "T"]:
-    """Height of the lowest point of both soles in each frame.  The rest pose (z up) stands with its soles at z = 0."""
-    rest = skeleton.rest_joints.double()
-    heights = []
-    for side in _SIDES:
-        foot = roles[side + "Foot"]
-        toe = roles.get(side + "ToeBase", foot)
-        forward = rest[toe] - rest[foot]
-        length = forward.norm() if toe != foot else rest.new_tensor(0.0)
-        # heel and ball below the foot's two joints, tip half a foot bone ahead of the ball
-        tip = rest[toe] + 0.5 * length * torch.tensor(_FORWARD, dtype=torch.float64)
-        for joint, point in ((foot, rest[foot]), (foot, rest[toe]), (toe, tip)):
-            on_sole = point * point.new_tensor([1.0, 1.0, 0.0])
-            heights.append((joints[:, joint] + rotation[:, joint] @ (on_sole - rest[joint]))[:, 2])
-    return torch.stack(heights).amin(0)
+def grounded(motion: Motion, body: Body, quantile: float = 0.1, frames: int = 400) -> Motion:
+    """The motion lifted or lowered as a whole, so that the body's lowest point is at z = 0.
+
+    The lowest point is taken over every frame (or that many, evenly chosen), and the quantile of those heights goes to
+    the floor: jumps do not pull it down, single slips of the capture below the floor do not lift it.
+    """
+    chosen = torch.linspace(0, len(motion) - 1, min(len(motion), frames)).long()
+    thinned = slice(None, None, max(1, len(body.template) // 2000))
+    pose = body.pose(motion.rotations[chosen], body.template.new_zeros(body.shape_count), motion.translation[chosen])
+    lowest = linear_blend(body.template[thinned], body.weights[thinned], pose.transforms)[..., 2].amin(-1)
+    return replace(
+        motion, translation=motion.translation - lowest.quantile(quantile) * lowest.new_tensor([0.0, 0.0, 1.0])
+    )
 
 
 # The stage
@@ -413,7 +494,7 @@ def retarget(
     motion: on its own skeleton, in any units and axes (as `formats.bvh` and `formats.amass` read it).  skeleton: the
     target, in metres; rest pose z up, facing -y (or as SMPL has it, y up).  mapping {role: joint of the motion} names
     joints that no convention knows; roles are the joint names of the default rig.  The path is scaled by leg length;
-    the pelvis is carried over at the middle of the hip joints.
+    the pelvis is carried over at the middle of the hip joints; `grounded` then puts it on the floor.
     Raises ValueError for unknown joint names, rest poses without direction, limbs without length.
     """
     config = config or RetargetConfig()
@@ -433,7 +514,7 @@ def retarget(
         log.info("%s: dropped %d T-pose frames at its start", motion.name or "motion", start)
     world, places = world[start:], places[start:]
 
-    A = rest_alignment(source, target, source_roles, target_roles, world, config)
+    A = rest_alignment(source, target, source_roles, target_roles, world, places, motion.fps, config)
     identity = torch.eye(3, dtype=torch.float64)
     role_of = {j: role for role, j in target_roles.items()}
     turned: list[Tensor] = []
@@ -453,10 +534,6 @@ def retarget(
     posed = forward_kinematics(rotations, rest, target.parents)
     source_middle = places[:, [source_roles[side + "UpLeg"] for side in _SIDES]].mean(1)
     root = scale * source_middle - (posed.joints[:, hips].mean(1) - rest[0])
-    if config.on_floor:
-        joints = posed.joints + (root - rest[0])[:, None]
-        heights = sole_heights(target, target_roles, G, joints)
-        root = root - heights.quantile(config.floor_quantile) * root.new_tensor([0.0, 0.0, 1.0])
 
     # Back to the axes of the target's own rest; its root then stands the body up in the world.
     rotations = target_turn.mT @ rotations @ target_turn

@@ -6,10 +6,11 @@ from pathlib import Path
 import torch
 
 from workbench.body.model import Body
-from workbench.formats.amass import amass_motion, is_amass
+from workbench.body.skeleton import Skeleton
+from workbench.formats.amass import amass_motion, is_amass, read_arrays, smpl_t_pose
 from workbench.formats.bvh import read_bvh
-from workbench.motion import Motion, is_own_motion, read_arrays
-from workbench.retargeting import RetargetConfig, retarget
+from workbench.motion import Motion, is_own_motion
+from workbench.retargeting import RetargetConfig, grounded, retarget
 
 __all__ = ["load_motion"]
 
@@ -22,7 +23,9 @@ def load_motion(
     mapping: Mapping[str, str] | None = None,
     config: RetargetConfig | None = None,
 ) -> Motion:
-    """Read a motion file and carry it over to the body: BVH, AMASS npz, or our own npz.
+    """Read a motion file (BVH, AMASS npz, our own npz), carry it over to the body, put it on the floor at z = 0.
+
+    Our own files for this very body come as they were saved.
 
     The frame rate is that of the file; fps says what it really is where the file is wrong (it does not resample:
     `Motion.resampled` does).  mapping {role: joint} names joints that no known convention has (see `retargeting`).
@@ -39,16 +42,18 @@ def load_motion(
             if _is_made_for(motion, body):
                 return Motion(motion.rotations, motion.translation, motion.fps, body.skeleton, motion.name)
         elif is_amass(arrays):
-            motion = amass_motion(arrays, path, fps=fps)
+            motion = amass_motion(arrays, path, fps=fps, rest=_smpl_rest(body.skeleton))
         else:
             raise ValueError(
                 f"{path} holds no motion: it is neither ours (no entry 'format') nor AMASS (no 'poses'), "
                 f"but has {', '.join(sorted(arrays)) or 'nothing'}"
             )
     else:
-        raise ValueError(f"{path}: motions are read from .bvh (any known rig) and .npz (AMASS, ours) files, not {kind!r}")
+        raise ValueError(
+            f"{path}: motions are read from .bvh (any known rig) and .npz (AMASS, ours) files, not {kind!r}"
+        )
     try:
-        return retarget(motion, body.skeleton, mapping=mapping, config=config)
+        return grounded(retarget(motion, body.skeleton, mapping=mapping, config=config), body)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -59,3 +64,12 @@ def _is_made_for(motion: Motion, body: Body) -> bool:
     return motion.skeleton.same_tree(skeleton) and torch.allclose(
         motion.skeleton.rest_joints, skeleton.rest_joints, rtol=0, atol=1e-3
     )
+
+
+def _smpl_rest(skeleton: Skeleton) -> Skeleton | None:
+    """The body's own rest pose if it is an SMPL body: then AMASS poses are about it and carry over unchanged."""
+    generic = smpl_t_pose()
+    count = len(generic)
+    if skeleton.names[:count] != generic.names or skeleton.parents[:count] != generic.parents:
+        return None
+    return Skeleton(generic.names, generic.parents, skeleton.rest_joints[:count])

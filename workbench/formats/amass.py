@@ -5,6 +5,8 @@ of average proportions.  Retargeting uses its directions only, and its leg lengt
 """
 
 import math
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +14,13 @@ import torch
 
 from workbench.body.skeleton import Skeleton
 from workbench.geometry.rotations import axis_angle_to_matrix
-from workbench.motion import Motion, read_arrays
+from workbench.motion import Motion
 from workbench.retargeting import Y_UP_FROM_Z_UP, reframed_skeleton
 
 _BODY = 22
 POSE_WIDTHS = {66: "body only", 72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
 """Numbers a frame of `poses`; the first 66 are the 22 body joints in all of them."""
 
-_POSE_KEYS = ("poses", "root_orient + pose_body")
 _RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "mocap_fps", "fps")
 
 # Ours, not SMPL's: left side and middle of a T-pose, y up, facing +z, metres; legs straight down, arms straight out.
@@ -56,6 +57,33 @@ def smpl_t_pose() -> Skeleton:
     return Skeleton(names, parents, torch.tensor([place for _, place in _T_POSE.values()]))
 
 
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """All arrays of an npz motion file but those of Python objects (labels in some AMASS files): none is unpickled.
+
+    Raises FileNotFoundError, or ValueError naming the file when it is truncated or no npz.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no motion file at {path}")
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if isinstance(archive, np.ndarray):
+                raise ValueError("it holds one bare array")
+            for key in archive.files:
+                try:
+                    arrays[key] = archive[key]
+                except ValueError as error:
+                    if "Object arrays" not in str(error):
+                        raise
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(
+            f"{path} is not readable as an npz motion (truncated, or of another kind): {reason}"
+        ) from error
+    return arrays
+
+
 def is_amass(arrays: dict[str, np.ndarray]) -> bool:
     """Do these arrays look like an AMASS motion?"""
     return "poses" in arrays or {"root_orient", "pose_body"} <= arrays.keys()
@@ -71,8 +99,13 @@ def read_amass(path: str | Path, *, fps: float | None = None) -> Motion:
     return amass_motion(read_arrays(path), path, fps=fps)
 
 
-def amass_motion(arrays: dict[str, np.ndarray], path: str | Path, *, fps: float | None = None) -> Motion:
-    """`read_amass` for arrays that are read already; path is for messages and the motion's name."""
+def amass_motion(
+    arrays: dict[str, np.ndarray], path: str | Path, *, fps: float | None = None, rest: Skeleton | None = None
+) -> Motion:
+    """`read_amass` for arrays that are read already; path is for messages and the motion's name.
+
+    rest: the 22 joints of the SMPL body in hand, in its own axes (y up, facing +z), instead of `smpl_t_pose`.
+    """
     poses, trans, rate = _body_poses(arrays, path), _path(arrays, path), _rate(arrays, path, fps)
     if len(poses) != len(trans):
         raise ValueError(f"{path}: poses have {len(poses)} frames, but trans has {len(trans)}")
@@ -81,15 +114,18 @@ def amass_motion(arrays: dict[str, np.ndarray], path: str | Path, *, fps: float 
     for key, values in (("poses", poses), ("trans", trans)):
         broken = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(broken):
-            raise ValueError(f"{path}: {key} must be finite, but frame {broken[0]} holds NaN or infinity; cut such frames out")
-    rest = smpl_t_pose()
+            raise ValueError(
+                f"{path}: {key} must be finite, but frame {broken[0]} holds NaN or infinity; cut such frames out"
+            )
+    rest = rest or smpl_t_pose()
     turn = Y_UP_FROM_Z_UP.mT  # SMPL's rest is y up, AMASS' world z up
     local = axis_angle_to_matrix(torch.from_numpy(poses).unflatten(1, (_BODY, 3)))
     rotations = turn @ local @ turn.mT
     rotations[:, 0] = local[:, 0] @ turn.mT  # the root goes from the turned rest to the world as it is
+    root = rest.rest_joints[0].double()  # at root + trans in the world, turned with the rest pose in the skeleton
     return Motion(
         rotations=rotations.float(),
-        translation=torch.from_numpy(trans).float(),
+        translation=(torch.from_numpy(trans) + root - turn @ root).float(),
         fps=rate,
         skeleton=reframed_skeleton(rest, turn),
         name=Path(path).stem,
@@ -104,13 +140,16 @@ def _body_poses(arrays: dict[str, np.ndarray], path: str | Path) -> np.ndarray:
         poses = np.concatenate([_real(arrays, "root_orient", path), _real(arrays, "pose_body", path)], axis=-1)
     else:
         raise ValueError(
-            f"{path} holds no motion: it has neither {' nor '.join(_POSE_KEYS)}, but {', '.join(sorted(arrays)) or 'nothing'}"
+            f"{path} holds no motion: it has neither poses nor root_orient and pose_body, "
+            f"but {', '.join(sorted(arrays)) or 'nothing'}"
         )
     if poses.ndim == 3 and poses.shape[-1] == 3:
         poses = poses.reshape(len(poses), -1)
     if poses.ndim != 2 or poses.shape[1] not in POSE_WIDTHS:
         known = ", ".join(f"{width} ({what})" for width, what in POSE_WIDTHS.items())
-        raise ValueError(f"{path}: poses must be (T, W) axis-angle numbers with W one of {known}, but are {poses.shape}")
+        raise ValueError(
+            f"{path}: poses must be (T, W) axis-angle numbers with W one of {known}, but are {poses.shape}"
+        )
     return poses[:, : 3 * _BODY]
 
 

@@ -117,7 +117,9 @@ def _check_outline(path: Path, lines: list[str]) -> int:
     words = (line.split() for line in lines)
     first = next((line for line in words if line), [])
     if not first or first[0].upper() != "HIERARCHY":
-        raise ValueError(f"{path}, line 1: a BVH file starts with HIERARCHY, but this one does not; is it another format?")
+        raise ValueError(
+            f"{path}, line 1: a BVH file starts with HIERARCHY, but this one does not; is it another format?"
+        )
     for number, line in enumerate(lines):
         if line.strip().upper() == "MOTION":
             return number
@@ -153,7 +155,9 @@ def _read_hierarchy(path: Path, lines: list[str], end: int) -> list[_Joint]:
             word = words.pop(0)
             keyword = word.upper()
             if declared is not None and word != "{":
-                raise ValueError(f"{path}, line {number}: expected '{{' after joint {joints[declared].name!r}, got {word!r}")
+                raise ValueError(
+                    f"{path}, line {number}: expected '{{' after joint {joints[declared].name!r}, got {word!r}"
+                )
             if keyword == "HIERARCHY":
                 continue
             if keyword in ("ROOT", "JOINT", "END"):
@@ -162,7 +166,9 @@ def _read_hierarchy(path: Path, lines: list[str], end: int) -> list[_Joint]:
                     title.append(words.pop(0))
                 parent = open_blocks[-1] if open_blocks else -1
                 if (keyword == "ROOT") != (parent == -1) or (keyword == "ROOT" and joints):
-                    raise ValueError(f"{path}, line {number}: a BVH file has one ROOT and all else inside it; got {word!r} here")
+                    raise ValueError(
+                        f"{path}, line {number}: a BVH file has one ROOT and all else inside it; got {word!r} here"
+                    )
                 name = joints[parent].name + END_SITE if keyword == "END" else " ".join(title)
                 if not name:
                     raise ValueError(f"{path}, line {number}: {word} needs a name")
@@ -191,7 +197,9 @@ def _read_hierarchy(path: Path, lines: list[str], end: int) -> list[_Joint]:
                 raise ValueError(f"{path}, line {number}: {word[:40]!r} is not expected in the HIERARCHY of a BVH file")
     if open_blocks or declared is not None:
         joint = joints[declared if declared is not None else open_blocks[-1]]
-        raise ValueError(f"{path}, line {end}: the block of joint {joint.name!r} is never closed; the file is truncated")
+        raise ValueError(
+            f"{path}, line {end}: the block of joint {joint.name!r} is never closed; the file is truncated"
+        )
     if not joints:
         raise ValueError(f"{path}, line {end}: the HIERARCHY holds no joint")
     return joints
@@ -229,12 +237,15 @@ def _read_frames(
     number, text = header(0, "Frames")
     frames = int(text) if text.isdigit() else -1
     if frames < 1:
-        raise ValueError(f"{path}, line {number}: a motion needs at least one frame, but the file says Frames: {text[:40]!r}")
+        raise ValueError(
+            f"{path}, line {number}: a motion needs at least one frame, but the file says Frames: {text[:40]!r}"
+        )
     number, text = header(1, "Frame Time")
     frame_time = float(text) if _is_number(text) else math.nan
     if fps is None and not (math.isfinite(frame_time) and frame_time > 0):
         raise ValueError(
-            f"{path}, line {number}: Frame Time must be a number of seconds above 0, but is {text[:40]!r}; pass fps=... if you know it"
+            f"{path}, line {number}: Frame Time must be a number of seconds above 0, but is {text[:40]!r}; "
+            f"pass fps=... if you know it"
         )
     width = sum(len(joint.channels) for joint in joints)
     rows = content[2:]
@@ -242,12 +253,15 @@ def _read_frames(
         if len(words) != width:
             hint = "; the file is truncated" if len(words) < width and number == rows[-1][0] else ""
             raise ValueError(
-                f"{path}, line {number}: a frame has one value for each of the {width} channels, but this has {len(words)}{hint}"
+                f"{path}, line {number}: a frame has one value for each of the {width} channels, "
+                f"but this has {len(words)}{hint}"
             )
     if len(rows) != frames:
         hint = "; it is truncated" if len(rows) < frames else ""
         last = rows[-1][0] if rows else number
-        raise ValueError(f"{path}, line {last}: the file says Frames: {frames}, but has {len(rows)} lines of values{hint}")
+        raise ValueError(
+            f"{path}, line {last}: the file says Frames: {frames}, but has {len(rows)} lines of values{hint}"
+        )
     values = np.array([_numbers(path, number, words, "channel values") for number, words in rows])
     rate = 1 / frame_time if frame_time > 0 else math.nan
     return values.reshape(frames, width), _round_rate(rate)
@@ -261,33 +275,39 @@ def _round_rate(rate: float) -> float:
 
 def _to_motion(path: Path, joints: list[_Joint], values: np.ndarray, fps: float) -> Motion:
     frames = len(values)
-    rest = torch.zeros(len(joints), 3, dtype=torch.float64)
+    offsets = torch.tensor([joint.offset for joint in joints], dtype=torch.float64)
     rotations = torch.eye(3, dtype=torch.float64).repeat(frames, len(joints), 1, 1)
-    translation = torch.zeros(frames, 3, dtype=torch.float64)
-    column, drifting = 0, []
+    places = offsets.repeat(frames, 1, 1)  # of each joint relative to its parent
+    column = 0
     for j, joint in enumerate(joints):
-        offset = torch.tensor(joint.offset, dtype=torch.float64)
-        rest[j] = offset + (rest[joint.parent] if joint.parent >= 0 else 0)
         here = torch.from_numpy(values[:, column : column + len(joint.channels)])
         column += len(joint.channels)
         rotations[:, j] = _joint_rotation(here, joint.channels)
-        positions = [c for c in joint.channels if c in _POSITIONS]
-        if not positions:
-            continue
-        place = offset.repeat(frames, 1)  # a position channel stands instead of that coordinate of the OFFSET
-        for channel in positions:
-            place[:, _POSITIONS.index(channel)] = here[:, joint.channels.index(channel)]
-        if joint.parent < 0:
-            translation = place - offset
-        elif (place - offset).abs().max() > 0.02 * max(float(offset.norm()), 1e-6):
-            drifting.append(joint.name)
+        for channel in joint.channels:
+            if channel in _POSITIONS:  # stands instead of that coordinate of the OFFSET
+                places[:, j, _POSITIONS.index(channel)] = here[:, joint.channels.index(channel)]
+    size = offsets[1:].norm(dim=-1).max() if len(joints) > 1 else 0.0
+    moving = ((places - offsets).abs().amax((0, 2)) > 1e-3 * size).tolist()
+    root = 0
+    while joints[root].children == 1 and root + 1 < len(joints) and moving[root + 1]:
+        # A reference joint above the one that travels: the two are one root.
+        places[:, root + 1] = places[:, root] + (rotations[:, root] @ places[:, root + 1, :, None])[..., 0]
+        rotations[:, root + 1] = rotations[:, root] @ rotations[:, root + 1]
+        root += 1
+    kept = joints[root:]
+    drifting = [joint.name for joint, moves in zip(kept[1:], moving[root + 1 :]) if moves]
     if drifting:
         log.warning(
             "%s: the positions of %d joints differ from their OFFSETs (%s); only the root's are kept",
             path, len(drifting), ", ".join(drifting[:5]),
         )  # fmt: skip
-    skeleton = Skeleton(tuple(j.name for j in joints), tuple(j.parent for j in joints), rest.float())
-    return Motion(rotations.float(), translation.float(), fps, skeleton, name=path.stem)
+    rest = offsets[root:].clone()
+    parents = tuple(max(joint.parent - root, -1) for joint in kept)
+    for j, parent in enumerate(parents[1:], 1):
+        rest[j] += rest[parent]
+    skeleton = Skeleton(tuple(joint.name for joint in kept), parents, rest.float())
+    translation = places[:, root] - rest[0]
+    return Motion(rotations[:, root:].float(), translation.float(), fps, skeleton, name=path.stem)
 
 
 def _joint_rotation(values: Float[Tensor, "T C"], channels: list[str]) -> Float[Tensor, "T 3 3"]:
