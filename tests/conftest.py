@@ -10,6 +10,8 @@ os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 
 from jaxtyping import install_import_hook
 
+import workbench.geometry.warp_kernels  # noqa: F401  Warp's kernels are no Python functions: imported unchecked
+
 install_import_hook(["workbench", "widgets"], "beartype.beartype")
 
 import numpy as np

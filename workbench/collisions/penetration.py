@@ -1,7 +1,7 @@
 """Sec. 6: which garment vertices are inside the body.  body (T,V,3), garment (T,N,3) -> inside (T,N), overlap (T,N).
 
-A vertex collides where the body's exact winding number exceeds 1/2.  Where it exceeds 3/2 the body overlaps itself, and no
-garment could be free of it: such vertices are counted apart, never left out.
+A vertex collides where the body's exact winding number exceeds 1/2.  Where it exceeds 3/2 the body overlaps itself, and
+no garment could be free of it: such vertices are counted apart, never left out.
 """
 
 from collections.abc import Callable
@@ -39,14 +39,14 @@ class Penetration:
 
 
 def penetration(
-    body_vertices: Float[Tensor, "T V 3"],
+    body_vertices: Float[Tensor, "B V 3"],
     body_faces: Int[Tensor, "F 3"],
     garment: Float[Tensor, "T N 3"],
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Penetration:
     """Exact inside test of every vertex in every frame.
 
-    `body_vertices` of one frame serves all garment frames (a constant body).
+    B is T, or 1 where one body serves all garment frames (the constant body of canonical space).
     Errors: ValueError when frame counts differ, positions are not finite, or the body is not closed.
     """
     if len(body_vertices) not in (1, len(garment)):
