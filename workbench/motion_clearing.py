@@ -1,0 +1,682 @@
+"""facts 9: the least rotation that takes arms off the body.  theta (T,J,3,3), body, beta -> theta with 30 mm of clearance.
+
+Cloth cannot live where the body overlaps itself, so motion is made clear of the body before it is simulated or judged.
+Unknown is one small rotation x a limb and frame (three angles at the shoulder, the bend of the elbow; three at the hip):
+
+    min_x  sum_t |x_t|^2 + (tau fps)^4 sum_t |x_(t-1) - 2 x_t + x_(t+1)|^2 + mu sum_i max(0, c_i + margin - d_i(x))^2
+
+d_i is the signed distance of sample i of the limb to the posed mesh of everything it must avoid, exact (closest point of
+the real triangles) and linearised; each round solves the convex piecewise quadratic program by active sets on a banded
+matrix.  c_i is the clearance, less where limb and body are neighbours already in the rest pose: near armpit and crotch.
+Legs come first (each gives way to the other), then arms (to torso, head, legs and each other).
+
+Not handled: a forearm in its own upper arm, a thigh in the belly, the head in a shoulder.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from workbench.body.model import Body
+from workbench.body.skinning import Pose, linear_blend
+from workbench.geometry.closest_point import ClosestPoint
+from workbench.geometry.mesh import boundary_loops, vertex_normals
+from workbench.geometry.rotations import axis_angle_to_matrix
+from workbench.motion import Motion
+
+log = logging.getLogger(__name__)
+
+# (root, hinge) of each limb, and the first joint of the head, in the two naming schemes that bodies come in.
+NAMES = (
+    {
+        "left arm": ("LeftArm", "LeftForeArm"),
+        "right arm": ("RightArm", "RightForeArm"),
+        "left leg": ("LeftUpLeg", None),
+        "right leg": ("RightUpLeg", None),
+        "head": ("Neck", None),
+    },
+    {
+        "left arm": ("left_shoulder", "left_elbow"),
+        "right arm": ("right_shoulder", "right_elbow"),
+        "left leg": ("left_hip", None),
+        "right leg": ("right_hip", None),
+        "head": ("neck", None),
+    },
+)
+LIMBS = ("left arm", "right arm", "left leg", "right leg")
+CHUNK = 32  # frames posed at once: bounds the memory
+
+
+@dataclass(frozen=True)
+class ClearingConfig:
+    """How far limbs stay off the body, and how smoothly they give way."""
+
+    clearance: float = 0.030  # metres, arms to torso and legs: facts 9
+    contact: float = 0.008  # metres, arm to arm and head, leg to leg: ours, contact resolved with room for a cloth
+    near: float = 0.05  # metres to the body in rest pose up to which an arm's sample is exempt (armpit): ours
+    far: float = 0.12  # and from which it owes the whole clearance; linear in between
+    leg_near: float = 0.03  # the same between the legs (crotch)
+    leg_far: float = 0.08
+    smoothing: float = 0.12  # seconds tau: a lone bump of contact is spread over about 4 tau: ours
+    margin: float = 0.0015  # metres aimed at beyond what is owed, against the gaps between samples
+    tolerance: float = 0.001  # metres short of what is owed that still count as clear
+    stiffness: float = 1e5  # mu, rad^2 / m^2: 1 mm of one sample weighs like 0.3 rad in one frame
+    samples: int = 220  # a limb; spread evenly over its surface
+    rounds: int = 14  # linearisations at most
+    step: float = 0.25  # radians a round at most
+
+
+@dataclass(frozen=True)
+class ClearedMotion:
+    """The cleared motion and what it took.  A limb's columns: left arm, right arm, left leg, right leg."""
+
+    motion: Motion
+    added: Float[np.ndarray, "T 4"]  # degrees of rotation added
+    shortfall_before: Float[np.ndarray, "T"]  # metres that the worst sample lacks of what it owes; 0 where clear
+    shortfall_after: Float[np.ndarray, "T"]
+    distance_before: Float[np.ndarray, "T"]  # metres, least signed distance of an arm's samples that owe the whole
+    distance_after: Float[np.ndarray, "T"]  # clearance to torso and legs; negative inside
+    unresolved: Bool[np.ndarray, "T"]  # frames still short by more than the tolerance
+
+
+@dataclass(frozen=True)
+class Part:
+    """A closed piece of the body: its faces, with every hole capped by a fan around the mean of its rim."""
+
+    vertices: Int[np.ndarray, "V"]  # of the body
+    faces: Int[np.ndarray, "F 3"]  # into `vertices`, then one cap centre a rim
+    rims: tuple[Int[np.ndarray, " R"], ...]  # into `vertices`
+
+    def with_centres(self, values: Float[np.ndarray, "N *C"]) -> Float[np.ndarray, "W *C"]:
+        """Values a body vertex -> values a vertex of the part; a cap's centre takes the mean of its rim."""
+        own = values[self.vertices]
+        return np.concatenate([own, *(own[rim].mean(0, keepdims=True) for rim in self.rims)])
+
+
+def closed_part(faces: Int[Tensor, "F 3"], chosen: Bool[Tensor, "V"]) -> Part:
+    """Faces with at least two chosen corners, closed."""
+    kept = faces[chosen[faces].sum(1) >= 2]
+    vertices, local = torch.unique(kept, return_inverse=True)
+    rims = tuple(rim.numpy() for rim in boundary_loops(local))
+    fans = [local.numpy()]
+    for cap, rim in enumerate(rims):
+        centre = np.full(len(rim), len(vertices) + cap)
+        fans.append(np.stack([np.roll(rim, -1), rim, centre], 1))
+    return Part(vertices.numpy(), np.concatenate(fans), rims)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the body that can be posed alone."""
+
+    rest: Float[Tensor, "N 3"]
+    pose_directions: Float[Tensor, "P N 3"]
+    weights: Float[Tensor, "N J"]
+
+    def posed(self, pose: Pose, coefficients: Float[Tensor, "T P"]) -> Float[Tensor, "T N 3"]:
+        P = len(self.pose_directions)
+        offsets = (coefficients @ self.pose_directions.reshape(P, -1)).unflatten(-1, (-1, 3))
+        return linear_blend(self.rest + offsets, self.weights, pose.transforms)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The vertices of a part, and the normals of its rest pose."""
+
+    points: Points
+    normals: Float[np.ndarray, "N 3"]
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A limb that may turn: where, what it carries, and what its samples owe."""
+
+    name: str
+    root: int
+    hinge: int | None
+    samples: Points
+    by_root: Float[np.ndarray, "N"]  # share of each sample that moves with the root joint
+    by_hinge: Float[np.ndarray, "N"]
+    owed_to_trunk: Float[np.ndarray, "N"]  # metres: torso and legs
+    owed_to_head: Float[np.ndarray, "N"]
+    owed_to_other: Float[np.ndarray, "N"]  # the same limb of the other side
+    part: Part
+    surface: Surface
+    surface_by_root: Float[np.ndarray, "V"]
+    surface_by_hinge: Float[np.ndarray, "V"]
+
+
+@dataclass(frozen=True)
+class Core:
+    """What arms must avoid and cannot move."""
+
+    part: Part
+    surface: Surface
+    head_faces: Bool[np.ndarray, "F"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Linearised distances: d_i(x) = distance + gradient . (x_frame - x0_frame)."""
+
+    frame: Int[np.ndarray, "N"]
+    gradient: Float[np.ndarray, "N D"]
+    distance: Float[np.ndarray, "N"]
+    owed: Float[np.ndarray, "N"]
+    whole: Bool[np.ndarray, "N"]  # the sample owes the whole clearance to torso or legs
+
+
+def clear(
+    motion: Motion, body: Body, betas: Float[Tensor, "K"] | None = None, config: ClearingConfig = ClearingConfig()
+) -> Motion:
+    """The nearest motion that keeps the arms off the body and limbs out of each other; see `clear_and_report`."""
+    return clear_and_report(motion, body, betas, config).motion
+
+
+def clear_and_report(
+    motion: Motion, body: Body, betas: Float[Tensor, "K"] | None = None, config: ClearingConfig = ClearingConfig()
+) -> ClearedMotion:
+    """Turn shoulders, elbows and hips by the least and smoothest rotation that clears the body of this shape.
+
+    betas (K): body shape, by default the mean.  A motion that is clear already comes back unchanged.
+    Frames that stay short of their clearance are named in `unresolved`, with a warning in the log.
+    Raises ValueError for another skeleton than the body's, wrong betas, NaN.
+    """
+    betas = body.mean_shape() if betas is None else betas
+    _check(motion, body, betas)
+    legs, arms, core = _limbs(body, betas, config)
+    leg_stage = Stage(body, betas, motion.fps, legs, None, config)
+    after_legs, leg_added, leg_before, leg_after = leg_stage.solve(motion.rotations)
+    arm_stage = Stage(body, betas, motion.fps, arms, core, config)
+    rotations, arm_added, arm_before, arm_after = arm_stage.solve(after_legs)
+    shortfall = np.maximum(leg_after.shortfall, arm_after.shortfall)
+    unresolved = shortfall > config.tolerance
+    if unresolved.any():
+        log.warning(
+            "motion %r: %d of %d frames stay up to %.1f mm short of their clearance",
+            motion.name,
+            int(unresolved.sum()),
+            len(motion),
+            1e3 * float(shortfall.max()),
+        )
+    return ClearedMotion(
+        motion=replace(motion, rotations=rotations),
+        added=np.concatenate([arm_added, leg_added], axis=1),
+        shortfall_before=np.maximum(leg_before.shortfall, arm_before.shortfall),
+        shortfall_after=shortfall,
+        distance_before=arm_before.distance,
+        distance_after=arm_after.distance,
+        unresolved=unresolved,
+    )
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a motion stands: per frame, the worst shortfall and the least distance to torso and legs."""
+
+    shortfall: Float[np.ndarray, "T"]
+    distance: Float[np.ndarray, "T"]
+
+
+class Stage:
+    """Two limbs that give way together: arms (with a core that does not move) or legs."""
+
+    def __init__(
+        self,
+        body: Body,
+        betas: Float[Tensor, "K"],
+        fps: float,
+        limbs: tuple[Limb, Limb],
+        core: Core | None,
+        config: ClearingConfig,
+    ):
+        self.body, self.betas, self.limbs, self.core, self.config = body, betas, limbs, core, config
+        self.smoothness = (config.smoothing * fps) ** 4
+        self.freedoms = 3 if limbs[0].hinge is None else 4
+
+    def solve(self, rotations: Float[Tensor, "T J 3 3"]) -> tuple[Tensor, np.ndarray, State, State]:
+        """(rotations, degrees added (T,2), state before, state after)."""
+        T, D, config = len(rotations), 2 * self.freedoms, self.config
+        bend = [_bend(rotations, self.body, limb) for limb in self.limbs]
+        x = np.zeros((T, D))
+        rows = self.rows(rotations, x, bend, np.arange(T))
+        before = after = _state(rows, T)
+        if (before.shortfall > config.tolerance).any():
+            best, best_worst = x, before
+            for _ in range(config.rounds):
+                x = _least_rotation(rows, x, self.smoothness, config)
+                rows = self.rows(rotations, x, bend, np.arange(T))
+                after = _state(rows, T)
+                if after.shortfall.sum() < best_worst.shortfall.sum():
+                    best, best_worst = x, after
+                if after.shortfall.max() <= 0.5 * config.tolerance:
+                    break
+            x, after = best, best_worst
+        turned = self.turned(rotations, x, bend) if np.any(x) else rotations
+        return turned, self.degrees(x, bend), before, after
+
+    def turned(
+        self, rotations: Float[Tensor, "T J 3 3"], x: Float[np.ndarray, "T D"], bend: Sequence["Bend | None"]
+    ) -> Float[Tensor, "T J 3 3"]:
+        """The motion with the rotations x applied."""
+        result = rotations.clone()
+        for k, limb in enumerate(self.limbs):
+            own = torch.from_numpy(x[:, k * self.freedoms : (k + 1) * self.freedoms]).to(rotations)
+            result[:, limb.root] = axis_angle_to_matrix(own[:, :3]) @ rotations[:, limb.root]
+            elbow = bend[k]
+            if limb.hinge is not None and elbow is not None:
+                turn = torch.from_numpy(elbow.applied(x[:, k * self.freedoms + 3])[:, None] * elbow.axis).to(rotations)
+                result[:, limb.hinge] = axis_angle_to_matrix(turn) @ rotations[:, limb.hinge]
+        return result
+
+    def degrees(self, x: Float[np.ndarray, "T D"], bend: Sequence["Bend | None"]) -> Float[np.ndarray, "T 2"]:
+        """Rotation added to each limb: at its root and, for arms, at the elbow."""
+        total = []
+        for k in range(2):
+            own = x[:, k * self.freedoms : (k + 1) * self.freedoms]
+            angle = np.linalg.norm(own[:, :3], axis=1)
+            elbow = bend[k]
+            total.append(angle if elbow is None else angle + np.abs(elbow.applied(own[:, 3])))
+        return np.rad2deg(np.stack(total, 1))
+
+    def rows(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        x: Float[np.ndarray, "T D"],
+        bend: Sequence["Bend | None"],
+        frames: Int[np.ndarray, "S"],
+    ) -> Rows:
+        """Distances of all samples and how they change with x, at these frames."""
+        turned = self.turned(rotations, x, bend)
+        found: list[Rows] = []
+        for start in range(0, len(frames), CHUNK):
+            chunk = frames[start : start + CHUNK]
+            theta = turned[chunk]
+            pose = self.body.pose(theta, self.betas)
+            coefficients = self.body.pose_coefficients(theta)
+            samples = [limb.samples.posed(pose, coefficients).numpy() for limb in self.limbs]
+            surfaces = [limb.surface.points.posed(pose, coefficients).numpy() for limb in self.limbs]
+            levers = [
+                _levers(
+                    limb, pose, theta, x[chunk, k * self.freedoms : k * self.freedoms + 3], bend[k], chunk, self.body
+                )
+                for k, limb in enumerate(self.limbs)
+            ]
+            turns = pose.transforms.rotation.numpy()
+            if self.core is not None:
+                still = self.core.surface.points.posed(pose, coefficients).numpy()
+                found += self._core_rows(chunk, samples, still, levers, turns)
+            found += self._pair_rows(chunk, samples, surfaces, levers, turns)
+        return Rows(
+            *(
+                np.concatenate([getattr(rows, name) for rows in found])
+                for name in ("frame", "gradient", "distance", "owed", "whole")
+            )
+        )
+
+    def _core_rows(
+        self,
+        frames: Int[np.ndarray, "S"],
+        samples: Sequence[np.ndarray],
+        still: Float[np.ndarray, "S V 3"],
+        levers: Sequence["Levers"],
+        turns: Float[np.ndarray, "S J 3 3"],
+    ) -> list[Rows]:
+        core = self.core
+        assert core is not None
+        mesh = ClosestPoint(still[0], core.part.faces)
+        counts = [samples[0].shape[1], samples[1].shape[1]]
+        owed_trunk = np.concatenate([limb.owed_to_trunk for limb in self.limbs])
+        owed_head = np.concatenate([limb.owed_to_head for limb in self.limbs])
+        found = []
+        for s, frame in enumerate(frames):
+            mesh.refit(still[s])
+            points = np.concatenate([samples[0][s], samples[1][s]])
+            hit = _signed(mesh, core.part, core.surface, points, turns[s])
+            head = core.head_faces[hit.face]
+            owed = np.where(head, owed_head, owed_trunk)
+            gradient = np.zeros((len(points), 2 * self.freedoms))
+            for k, part in enumerate((slice(0, counts[0]), slice(counts[0], None))):
+                own = slice(k * self.freedoms, (k + 1) * self.freedoms)
+                gradient[part, own] = levers[k].gradient(
+                    s, points[part], hit.normal[part], self.limbs[k].by_root, self.limbs[k].by_hinge
+                )
+            whole = ~head & (owed_trunk >= self.config.clearance)
+            found.append(Rows(np.full(len(points), frame), gradient, hit.distance, owed, whole))
+        return found
+
+    def _pair_rows(
+        self,
+        frames: Int[np.ndarray, "S"],
+        samples: Sequence[np.ndarray],
+        surfaces: Sequence[np.ndarray],
+        levers: Sequence["Levers"],
+        turns: Float[np.ndarray, "S J 3 3"],
+    ) -> list[Rows]:
+        """Samples of each limb against the other limb's mesh, which gives way too."""
+        found = []
+        meshes: dict[int, ClosestPoint] = {}
+        for k in range(2):
+            limb, other = self.limbs[k], self.limbs[1 - k]
+            for s, frame in enumerate(frames):
+                points, surface = samples[k][s], surfaces[1 - k][s]
+                reach = self.config.contact + 0.05
+                near = ((points > surface.min(0) - reach) & (points < surface.max(0) + reach)).all(1)
+                near &= limb.owed_to_other > 0
+                if not near.any():
+                    continue
+                if k in meshes:
+                    meshes[k].refit(surface)
+                else:
+                    meshes[k] = ClosestPoint(surface, other.part.faces)
+                points = points[near]
+                hit = _signed(meshes[k], other.part, other.surface, points, turns[s])
+                gradient = np.zeros((len(points), 2 * self.freedoms))
+                own = slice(k * self.freedoms, (k + 1) * self.freedoms)
+                theirs = slice((1 - k) * self.freedoms, (2 - k) * self.freedoms)
+                gradient[:, own] = levers[k].gradient(s, points, hit.normal, limb.by_root[near], limb.by_hinge[near])
+                by_root = (other.surface_by_root[hit.vertices] * hit.share).sum(1)
+                by_hinge = (other.surface_by_hinge[hit.vertices] * hit.share).sum(1)
+                gradient[:, theirs] = -levers[1 - k].gradient(s, hit.point, hit.normal, by_root, by_hinge)
+                none = np.zeros(len(points), bool)
+                found.append(Rows(np.full(len(points), frame), gradient, hit.distance, limb.owed_to_other[near], none))
+        if not found:
+            D = 2 * self.freedoms
+            empty = np.zeros(0)
+            found.append(Rows(np.zeros(0, int), np.zeros((0, D)), empty, empty, np.zeros(0, bool)))
+        return found
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Closest points with a sign: positive outside."""
+
+    face: Int[np.ndarray, "N"]
+    point: Float[np.ndarray, "N 3"]
+    distance: Float[np.ndarray, "N"]
+    normal: Float[np.ndarray, "N 3"]  # the direction in which the distance grows
+    vertices: Int[np.ndarray, "N 3"]  # of the part
+    share: Float[np.ndarray, "N 3"]  # barycentric
+
+
+def _signed(
+    mesh: ClosestPoint,
+    part: Part,
+    surface: Surface,
+    points: Float[np.ndarray, "N 3"],
+    turns: Float[np.ndarray, "J 3 3"],
+) -> Hit:
+    """Signed distances; the side comes from the vertex normals, turned with the skin (smooth, and cheap)."""
+    near = mesh.query(points)
+    corners = part.faces[near.face]
+    normals = surface.normals[corners]
+    weights = surface.points.weights.numpy()[corners]
+    turned = np.einsum("nkj,jab,nkb->nka", weights, turns, normals, optimize=True)
+    normal = (near.barycentric[..., None] * turned).sum(1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+    away = points - near.point
+    sign = np.where((away * normal).sum(1) < 0, -1.0, 1.0)
+    sure = near.distance > 1e-5
+    direction = np.where(sure[:, None], sign[:, None] * away / np.maximum(near.distance, 1e-5)[:, None], normal)
+    return Hit(near.face, near.point, sign * near.distance, direction, corners, near.barycentric)
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The hinge of a limb: it bends and straightens about its present axis, never past straight."""
+
+    axis: Float[np.ndarray, "T 3"]  # in the frame of the root joint
+    angle: Float[np.ndarray, "T"]  # radians from straight
+    gain: Float[np.ndarray, "T"]  # 0 where a straight limb has no axis
+
+    def applied(self, x: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+        """Radians really added for the unknown x."""
+        return np.clip(self.gain * x, -0.9 * self.angle, np.maximum(0, MOST_BENT - self.angle))
+
+
+MOST_BENT = np.deg2rad(150.0)
+BEND_FROM, BEND_FULLY = np.deg2rad(15.0), np.deg2rad(45.0)
+
+
+def _bend(rotations: Float[Tensor, "T J 3 3"], body: Body, limb: Limb) -> Bend | None:
+    if limb.hinge is None:
+        return None
+    child = body.parents.index(limb.hinge)
+    rest = body.joint_template.double()
+    upper = torch.nn.functional.normalize(rest[limb.hinge] - rest[limb.root], dim=0)
+    lower = torch.nn.functional.normalize(rest[child] - rest[limb.hinge], dim=0)
+    bent = rotations[:, limb.hinge].double() @ lower
+    axis = torch.linalg.cross(upper.expand_as(bent), bent)
+    angle = torch.atan2(axis.norm(dim=-1), bent @ upper).numpy()
+    s = np.clip((angle - BEND_FROM) / (BEND_FULLY - BEND_FROM), 0, 1)
+    return Bend(torch.nn.functional.normalize(axis, dim=-1).numpy(), angle, s * s * (3 - 2 * s))
+
+
+@dataclass(frozen=True)
+class Levers:
+    """Where a limb turns, in the world, at the frames of a chunk."""
+
+    root: Float[np.ndarray, "S 3"]
+    axes: Float[np.ndarray, "S 3 3"]  # columns: where the three unknowns turn the limb about
+    hinge: Float[np.ndarray, "S 3"] | None
+    hinge_axis: Float[np.ndarray, "S 3"] | None  # times its gain
+
+    def gradient(
+        self,
+        s: int,
+        points: Float[np.ndarray, "N 3"],
+        normals: Float[np.ndarray, "N 3"],
+        by_root: Float[np.ndarray, "N"],
+        by_hinge: Float[np.ndarray, "N"],
+    ) -> Float[np.ndarray, "N D"]:
+        """d(normal . point)/dx of points carried by the limb."""
+        moment = np.cross(points - self.root[s], normals)
+        columns = by_root[:, None] * (moment @ self.axes[s])
+        if self.hinge is None or self.hinge_axis is None:
+            return columns
+        bend = by_hinge * (np.cross(points - self.hinge[s], normals) @ self.hinge_axis[s])
+        return np.concatenate([columns, bend[:, None]], 1)
+
+
+def _levers(
+    limb: Limb,
+    pose: Pose,
+    theta: Float[Tensor, "S J 3 3"],
+    turn: Float[np.ndarray, "S 3"],
+    bend: Bend | None,
+    frames: Int[np.ndarray, "S"],
+    body: Body,
+) -> Levers:
+    world = pose.transforms.rotation.double().numpy()
+    joints = pose.joints.double().numpy()
+    axes = world[:, body.parents[limb.root]] @ left_jacobian(turn)
+    if limb.hinge is None or bend is None:
+        return Levers(joints[:, limb.root], axes, None, None)
+    hinge_axis = np.einsum("sab,sb->sa", world[:, limb.root], bend.axis[frames]) * bend.gain[frames, None]
+    return Levers(joints[:, limb.root], axes, joints[:, limb.hinge], hinge_axis)
+
+
+def left_jacobian(w: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3 3"]:
+    """J with exp(w + dw) = exp(J dw) exp(w) to first order (Sola et al. 2018, Eq. 145)."""
+    squared = (w * w).sum(1)[:, None, None]
+    small = squared < 1e-6
+    angle = np.sqrt(np.where(small, 1.0, squared))
+    first = np.where(small, 0.5 - squared / 24, (1 - np.cos(angle)) / angle**2)
+    second = np.where(small, 1 / 6 - squared / 120, (angle - np.sin(angle)) / angle**3)
+    K = np.zeros((len(w), 3, 3))
+    K[:, 2, 1], K[:, 0, 2], K[:, 1, 0] = w.T
+    K[:, 1, 2], K[:, 2, 0], K[:, 0, 1] = -w.T
+    return np.eye(3) + first * K + second * (K @ K)
+
+
+def _state(rows: Rows, frames: int) -> State:
+    shortfall, distance = np.zeros(frames), np.full(frames, np.inf)
+    np.maximum.at(shortfall, rows.frame, np.where(rows.owed > 0, rows.owed - rows.distance, 0.0))
+    np.minimum.at(distance, rows.frame[rows.whole], rows.distance[rows.whole])
+    return State(shortfall, distance)
+
+
+def _least_rotation(
+    rows: Rows, x: Float[np.ndarray, "T D"], smoothness: float, config: ClearingConfig
+) -> Float[np.ndarray, "T D"]:
+    """The minimum over x of the sum in this file's first lines with linearised distances, by active sets."""
+    T, D = x.shape
+    aim = rows.owed + config.margin
+    keep = (rows.owed > 0) & (rows.distance < aim + config.step * 0.5)
+    frame, g, aim, distance = rows.frame[keep], rows.gradient[keep], aim[keep], rows.distance[keep]
+    offset = distance - (g * x[frame]).sum(1)  # distance = offset + g . x
+    base = _smooth_rotation_matrix(T, D, smoothness)
+    solution = x
+    for _ in range(8):
+        short = aim - offset - (g * solution[frame]).sum(1) > 0
+        matrix, right = base.copy(), np.zeros((T, D))
+        blocks = np.zeros((T, D, D))
+        a, t = g[short], frame[short]
+        for i in range(D):
+            right[:, i] = config.stiffness * np.bincount(t, a[:, i] * (aim - offset)[short], T)
+            for j in range(i, D):
+                blocks[:, i, j] = config.stiffness * np.bincount(t, a[:, i] * a[:, j], T)
+        for i in range(D):
+            for j in range(i, D):
+                # upper banded storage: entry (r, c) is at [bands + r - c, c]
+                matrix[2 * D + i - j, j::D] += blocks[:, i, j]
+        previous, solution = solution, solveh_banded(matrix, right.ravel()).reshape(T, D)
+        if np.abs(solution - previous).max() < 1e-5:
+            break
+    longest = np.abs(solution - x).max(1, keepdims=True)
+    return x + (solution - x) * np.minimum(1, config.step / np.maximum(longest, 1e-9)).min()
+
+
+def _smooth_rotation_matrix(T: int, D: int, smoothness: float) -> Float[np.ndarray, "B N"]:
+    """sum |x_t|^2 + smoothness * sum |second difference|^2 as an upper banded matrix, frame-major."""
+    bands = np.zeros((2 * D + 1, T * D))
+    diagonal, first, second = np.ones(T), np.zeros(T), np.zeros(T)
+    if T >= 3:
+        for offset, value in ((0, 1.0), (1, 4.0), (2, 1.0)):
+            diagonal[offset : T - 2 + offset] += smoothness * value
+        first[1 : T - 1] += -2 * smoothness
+        first[2:T] += -2 * smoothness
+        second[2:T] += smoothness
+    bands[2 * D] = np.repeat(diagonal, D)
+    bands[D] = np.repeat(first, D)
+    bands[0] = np.repeat(second, D)
+    return bands
+
+
+# ---- parts of the body
+
+
+def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tuple:
+    """(legs, arms, core) of a body shape."""
+    skeleton = body.skeleton
+    names = next((scheme for scheme in NAMES if scheme["left arm"][0] in skeleton.names), None)
+    if names is None:
+        raise ValueError(
+            f"body '{body.name}' has no joint called {NAMES[0]['left arm'][0]} or {NAMES[1]['left arm'][0]}: clearing "
+            "needs to know arms and legs; name the joints as the default body's or as SMPL's"
+        )
+    carried = {part: torch.tensor(skeleton.descendants(skeleton.index(joint))) for part, (joint, _) in names.items()}
+    owner = body.weights.argmax(1)
+    belongs = {part: torch.isin(owner, joints) for part, joints in carried.items()}
+    rest = body.template + body.shape_offsets(betas)
+    parts = {part: closed_part(body.faces, belongs[part]) for part in LIMBS}
+    core_part = closed_part(body.faces, ~(belongs["left arm"] | belongs["right arm"]))
+    core = Core(core_part, _surface(body, rest, core_part), _faces_of(core_part, belongs["head"]))
+    still = ClosestPoint(core_part.with_centres(rest.numpy()), core_part.faces)
+
+    def limb(name: str, other: str) -> Limb:
+        root, hinge = (None if joint is None else skeleton.index(joint) for joint in names[name])
+        assert root is not None
+        own = np.flatnonzero(belongs[name].numpy())
+        points = rest[own].numpy()
+        other_part = parts[other]
+        apart = ClosestPoint(other_part.with_centres(rest.numpy()), other_part.faces)
+        if hinge is None:
+            to_trunk = to_head = np.zeros(len(own))
+            to_other = _owed(apart.query(points).distance, config.contact, config.leg_near, config.leg_far)
+        else:
+            off = still.query(points).distance
+            to_trunk = _owed(off, config.clearance, config.near, config.far)
+            to_head = _owed(off, config.contact, config.near, config.far)
+            to_other = _owed(apart.query(points).distance, config.contact, config.near, config.far)
+        chosen = _spread(points, np.maximum(to_trunk, to_other) > 0, config.samples)
+        by_root = body.weights[:, carried[name]].sum(1).double().numpy()
+        below = torch.tensor(skeleton.descendants(hinge)) if hinge is not None else torch.zeros(0, dtype=torch.long)
+        by_hinge = body.weights[:, below].sum(1).double().numpy()
+        return Limb(
+            name=name,
+            root=root,
+            hinge=hinge,
+            samples=_points(body, rest, own[chosen]),
+            by_root=by_root[own[chosen]],
+            by_hinge=by_hinge[own[chosen]],
+            owed_to_trunk=to_trunk[chosen],
+            owed_to_head=to_head[chosen],
+            owed_to_other=to_other[chosen],
+            part=parts[name],
+            surface=_surface(body, rest, parts[name]),
+            surface_by_root=parts[name].with_centres(by_root),
+            surface_by_hinge=parts[name].with_centres(by_hinge),
+        )
+
+    legs = (limb("left leg", "right leg"), limb("right leg", "left leg"))
+    arms = (limb("left arm", "right arm"), limb("right arm", "left arm"))
+    return legs, arms, core
+
+
+def _owed(distance_in_rest: Float[np.ndarray, "N"], clearance: float, near: float, far: float) -> np.ndarray:
+    """c_i: nothing up to `near` in the rest pose, all of it from `far`."""
+    return clearance * np.clip((distance_in_rest - near) / (far - near), 0, 1).astype(np.float64)
+
+
+def _points(body: Body, rest: Float[Tensor, "V 3"], index: Int[np.ndarray, "N"]) -> Points:
+    return Points(rest[index], body.pose_directions[:, index].contiguous(), body.weights[index])
+
+
+def _surface(body: Body, rest: Float[Tensor, "V 3"], part: Part) -> Surface:
+    points = torch.from_numpy(part.with_centres(rest.numpy()))
+    directions = torch.from_numpy(part.with_centres(body.pose_directions.transpose(0, 1).numpy()))
+    weights = torch.from_numpy(part.with_centres(body.weights.numpy()))
+    normals = vertex_normals(points, torch.from_numpy(part.faces))  # of the closed part: its rim has two sides
+    return Surface(Points(points, directions.transpose(0, 1).contiguous(), weights), normals.numpy())
+
+
+def _faces_of(part: Part, chosen: Bool[Tensor, "V"]) -> Bool[np.ndarray, "F"]:
+    """Faces of a part whose real corners are all chosen (caps never are)."""
+    flags = np.concatenate([chosen.numpy()[part.vertices], np.zeros(len(part.rims), bool)])
+    return flags[part.faces].all(1)
+
+
+def _spread(points: Float[np.ndarray, "N 3"], allowed: Bool[np.ndarray, "N"], count: int) -> Int[np.ndarray, "S"]:
+    """Farthest-point samples among the allowed points."""
+    index = np.flatnonzero(allowed)
+    if len(index) <= count:
+        return index
+    cloud = points[index]
+    chosen = [int(np.abs(cloud[:, 0]).argmax())]
+    distance = ((cloud - cloud[chosen[0]]) ** 2).sum(1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, ((cloud - cloud[chosen[-1]]) ** 2).sum(1))
+    return index[np.array(chosen)]
+
+
+def _check(motion: Motion, body: Body, betas: Tensor) -> None:
+    if motion.skeleton.names != body.joint_names or motion.skeleton.parents != body.parents:
+        raise ValueError(
+            f"motion {motion.name!r} has {len(motion.skeleton)} joints of another skeleton than the {len(body.parents)} of "
+            f"body '{body.name}'; retarget it first (workbench.formats.load_motion(path, body))"
+        )
+    if tuple(betas.shape) != (body.shape_count,):
+        raise ValueError(
+            f"betas must be one shape of {body.shape_count} components for body '{body.name}', "
+            f"but have shape {tuple(betas.shape)}"
+        )
+    if not torch.isfinite(betas).all():
+        raise ValueError("betas must be finite, but hold NaN or infinity")
