@@ -10,8 +10,9 @@ in p and repeatable (independent draws would make them noise).
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.geometry.closest_point import ClosestPoint, checked_points, morton_order, run_chunks
+from workbench.geometry.field_grid import FieldGrid, GridConfig, Quantisation, tabulate
 from workbench.geometry.sampling import gaussian_directions
 from workbench.geometry.warp_kernels import gaussian_neighbours
 from workbench.learning.mlp import MLP, load_network, save_network
@@ -334,3 +336,111 @@ def _beside(points: Float[Tensor, "*B N 3"], condition: Float[Tensor, "*B c"]) -
     """concat(p, condition) for every point."""
     expanded = condition[..., None, :].expand(*points.shape[:-1], condition.shape[-1])
     return torch.cat([points, expanded], dim=-1)
+
+
+# The table
+
+
+@dataclass(frozen=True)
+class GridFieldsConfig:
+    """How Eq. 4-6 are tabulated.  Tolerances are the largest error a cell may have at its middle points at the surface; they
+    grow linearly with the distance, doubling at `relax` metres.  Ours, measured (see the README's table)."""
+
+    samples: int = 512  # N of Eq. 4-6, quasi-random: error 0.001 in L1
+    seed: int = 0
+    weights: float = 0.03  # L1
+    shape: float = 1.5e-3  # metres, root mean square over beta ~ N(0, I)
+    pose: float = 1.5e-3  # metres, root mean square over coefficients of POSE_SPREAD
+    relax: float = 0.08  # metres
+    grid: GridConfig = GridConfig(root_size=0.128, depth=4)  # 8 mm at the finest
+    weight_step: float = 1 / 1024
+    offset_step: float = 1.5e-4  # metres
+
+
+POSE_SPREAD = 0.25  # typical coefficient of a pose direction over random poses
+
+
+class GridFields(LinearFields):
+    """Eq. 4-6 read off a table: eight rows a point, the exact gradient of the interpolant, any points (the border's value
+    outside of the box)."""
+
+    def __init__(self, grid: FieldGrid, body: Body):
+        self.layout = FieldLayout.of(body)
+        fingerprint = body_fingerprint(body)
+        if grid.channels != self.layout.channels:
+            raise ValueError(
+                f"the grid has {grid.channels} channels, but body '{body.name}' needs {self.layout.channels} "
+                f"({self.layout}); tabulate its fields with GridFields.tabulate(body)"
+            )
+        if grid.compact.made_for != fingerprint:
+            raise ValueError(
+                f"the grid was made for another body ({grid.compact.made_for}, '{body.name}' is {fingerprint}); "
+                "make it again with `python -m assets_gen checkpoints` or GridFields.tabulate(body)"
+            )
+        self.grid = grid
+        self.pose_map = body.pose_map
+
+    def at(self, points: Float[Tensor, "*B N 3"]) -> FieldValues:
+        return self.layout.split(self.grid.at(points))
+
+    def save(self, path: str | Path) -> None:
+        """Write the grid (npz)."""
+        self.grid.save(path)
+
+    @staticmethod
+    def load(path: str | Path, body: Body) -> "GridFields":
+        """Read what `save` wrote.  ValueError for a damaged file or one made for another body."""
+        return GridFields(FieldGrid.load(path), body)
+
+    @staticmethod
+    def default(body: Body | None = None) -> "GridFields":
+        """The grid that ships, for the default body (read once a process)."""
+        if body is None or body is Body.default():
+            return _default_grid()
+        return GridFields.load(FIELDS_FOLDER / "fields.npz", body)
+
+    @staticmethod
+    def tabulate(
+        body: Body,
+        config: GridFieldsConfig | None = None,
+        *,
+        progress: Callable[[int, int, int], None] | None = None,
+    ) -> "GridFields":
+        """Tabulate the Monte-Carlo fields of a body in the box of BOX_MARGIN around it (minutes)."""
+        config = config or GridFieldsConfig()
+        exact = MonteCarloFields(body, samples=config.samples, seed=config.seed)
+        layout = exact.layout
+
+        def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n C"]:
+            return exact.expectation(torch.from_numpy(points)).numpy().astype(np.float64)
+
+        def error(surplus: Float[np.ndarray, "m C"], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+            weights, shape, pose = np.split(surplus, [layout.joints, layout.joints + 3 * layout.shapes], axis=1)
+            ratio = np.maximum(
+                np.abs(weights).sum(1) / config.weights,
+                np.maximum(
+                    np.linalg.norm(shape, axis=1) / config.shape,
+                    np.linalg.norm(pose, axis=1) * POSE_SPREAD / config.pose,
+                ),
+            )
+            return ratio / (1 + exact.closest.query(points).distance / config.relax)
+
+        step = np.full(layout.channels, config.offset_step)
+        step[: layout.joints] = config.weight_step
+        vertices = body.template.numpy()
+        grid = tabulate(
+            field,
+            error,
+            vertices.min(0) - BOX_MARGIN,
+            vertices.max(0) + BOX_MARGIN,
+            Quantisation(step, simplex=(0, layout.joints)),
+            config.grid,
+            made_for=body_fingerprint(body),
+            progress=progress,
+        )
+        return GridFields(grid, body)
+
+
+@cache
+def _default_grid() -> GridFields:
+    return GridFields.load(FIELDS_FOLDER / "fields.npz", Body.default())

@@ -123,3 +123,42 @@ def gaussian_neighbours(
         hit = wp.mesh_query_point_no_sign(mesh, p + sigma * directions[n], 1.0e6)
         face[i, n] = hit.face
         barycentric[i, n] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+
+
+@wp.kernel
+def locate_in_octree(
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    low: wp.vec3,
+    root_size: float,
+    shape: wp.vec3i,
+    child: wp.array(dtype=wp.int32),
+    cell: wp.array(dtype=wp.int32),
+    local: wp.array(dtype=wp.vec3),
+    size: wp.array(dtype=wp.float32),
+):
+    """The leaf cell that holds each point (clamped to the box), its edge, and where in it, in [0, 1]^3."""
+    n = start + wp.tid()
+    x = (points[n] - low) / root_size
+    u = wp.vec3(0.0, 0.0, 0.0)
+    index = int(0)  # noqa: UP018
+    for axis in range(3):
+        clamped = wp.clamp(x[axis], 0.0, float(shape[axis]))
+        i = wp.min(int(clamped), shape[axis] - 1)
+        u[axis] = clamped - float(i)
+        index = index * shape[axis] + i
+    edge = float(root_size)
+    down = child[index]
+    while down >= 0:
+        octant = int(0)  # noqa: UP018
+        for axis in range(3):
+            doubled = 2.0 * u[axis]
+            i = wp.min(int(doubled), 1)
+            u[axis] = doubled - float(i)
+            octant = 2 * octant + i
+        index = down + octant
+        edge = 0.5 * edge
+        down = child[index]
+    cell[n] = index
+    local[n] = u
+    size[n] = edge
