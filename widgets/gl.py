@@ -49,3 +49,7 @@ def ensure_can_draw() -> None:
     reason = fault()
     if reason:
         raise CannotDraw(f"this machine cannot draw ({reason}): run {GL_COMMAND}")
+
+
+if __name__ == "__main__":  # `workbench doctor` asks from outside, in a process of its own
+    raise SystemExit(fault() or 0)

@@ -27,6 +27,9 @@ from workbench.store import atomic_write
 
 Colour = tuple[float, float, float]  # linear red, green, blue in [0, 1]
 
+SKIN: Colour = (0.72, 0.50, 0.38)
+CLOTH: Colour = (0.10, 0.26, 0.52)
+
 ENCODINGS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
@@ -43,6 +46,11 @@ class GltfMesh:
     roughness: float = 0.8
     double_sided: bool = False  # cloth is seen from both sides
     smooth: bool = True  # False leaves out normals: smaller, shown with flat facets
+
+
+def dressed_meshes(body: MeshSequence, garment: MeshSequence) -> list[GltfMesh]:
+    """A body and its garment as they look in a viewer."""
+    return [GltfMesh(body, SKIN, roughness=0.6), GltfMesh(garment, CLOTH, roughness=0.9, double_sided=True)]
 
 
 def write_glb(path: str | Path, meshes: Sequence[GltfMesh]) -> None:

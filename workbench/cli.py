@@ -1,0 +1,258 @@
+"""`workbench COMMAND`: words -> a stage's config -> its result.  Status 0, 2 (unusable input, one line), 1 (our fault).
+
+Each command imports its stage only when it is called, so that `workbench --help` answers at once.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import importlib.metadata
+import io
+import logging
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from workbench import __version__
+from workbench.extras import MissingExtra
+
+DONE, INTERNAL, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+OURS = ("workbench", "widgets", "assets_gen")
+
+# `workbench evaluate NAME`: where its config class and its `rows(config)` are
+EVALUATIONS = {
+    "fields": ("workbench.collisions.field_evaluation", "FieldEvaluation"),
+    "projection": ("workbench.collisions.projection_evaluation", "ProjectionEvaluation"),
+}
+# `workbench train STAGE`: where its config class and its `run(config)` are
+TRAININGS = {"fields": ("workbench.collisions.field_training", "TrainFieldsConfig")}
+
+
+class Unusable(Exception):
+    """Words on the command line that cannot be used; its text is one line."""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    words = list(sys.argv[1:] if words is None else words)
+    _log_to_output()
+    try:
+        return _dispatch(words)
+    except Unusable as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        return _tell_interrupted()
+    except Exception as error:  # noqa: BLE001  the outermost border: unusable input ends in a line, a fault of ours in a traceback
+        if is_unusable_input(error):
+            return _refuse(_one_line(error))
+        traceback.print_exc()
+        return INTERNAL
+
+
+def is_unusable_input(error: BaseException) -> bool:
+    """A file that cannot be opened, an extra that is missing, or a ValueError that our own code raised.
+
+    A ValueError from inside a library is a fault of ours: it should have been checked at the border.
+    """
+    if isinstance(error, MissingExtra | FileNotFoundError | NotADirectoryError | IsADirectoryError | PermissionError):
+        return True
+    if not isinstance(error, ValueError):
+        return False
+    frames = list(traceback.walk_tb(error.__traceback__))
+    return bool(frames) and frames[-1][0].f_globals.get("__name__", "").partition(".")[0] in OURS
+
+
+# --- commands
+
+
+def demo(words: list[str]) -> int:
+    from workbench.demo import DemoConfig, run
+
+    config = parsed(DemoConfig, "workbench demo", words)
+    picture = plugged_in("workbench.pictures", "demo")
+    run(config, picture=picture)
+    _say(f"written: {', '.join(str(path) for path in sorted(config.out.glob('*')))}")
+    return DONE
+
+
+def evaluate(words: list[str]) -> int:
+    name, rest = _choice("workbench evaluate", "NAME", EVALUATIONS, words)
+    module_name, config_name = EVALUATIONS[name]
+    module = importlib.import_module(module_name)
+    from workbench.evaluation_table import format_table, write_json
+
+    options = parsed(_with_json(getattr(module, config_name)), f"workbench evaluate {name}", rest)
+    rows = module.rows(options.config)
+    _say(format_table(rows))
+    if options.json is not None:
+        write_json(options.json, name, rows)
+    return DONE
+
+
+def train(words: list[str]) -> int:
+    stage, rest = _choice("workbench train", "STAGE", TRAININGS, words)
+    module_name, config_name = TRAININGS[stage]
+    module = importlib.import_module(module_name)
+    module.run(parsed(getattr(module, config_name), f"workbench train {stage}", rest))
+    return DONE
+
+
+def export(words: list[str]) -> int:
+    from workbench.export import ExportConfig, run
+
+    written = run(parsed(ExportConfig, "workbench export", words))
+    _say(f"written: {', '.join(map(str, written))}")
+    return DONE
+
+
+def doctor(words: list[str]) -> int:
+    from workbench import doctor as machine
+
+    if words and words[0] in ("-h", "--help"):
+        _say("usage: workbench doctor\n\nWhat this machine has and lacks, with the one command that mends it.")
+        return DONE
+    if words:
+        raise Unusable(f"workbench doctor takes no options, got {' '.join(words)!r}")
+    _say(machine.report(machine.run()))
+    return DONE
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command: its function and the line that tells what it does."""
+
+    run: Callable[[list[str]], int]
+    arguments: str
+    does: str
+
+
+COMMANDS = {
+    "demo": Command(
+        demo, "[--out DIR]", "simulated cloth to canonical space and back on another body: .glb, .png, report"
+    ),
+    "evaluate": Command(evaluate, "fields|projection [--json FILE]", "the figures of a stage, with their bounds"),
+    "train": Command(train, "fields", "train a stage; a run that was ended continues"),
+    "export": Command(export, "SEQUENCE.npz --out PATH", "a sequence as .glb, .npz, OBJ, PLY or PC2"),
+    "doctor": Command(doctor, "", "what this machine has and lacks, with the command that mends it"),
+}
+
+
+def usage() -> str:
+    width = max(len(f"{name} {command.arguments}") for name, command in COMMANDS.items())
+    lines = [f"  {f'{name} {command.arguments}':<{width}}  {command.does}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        ["usage: workbench COMMAND [OPTIONS]", "", *lines, "", "workbench COMMAND --help explains each; --version."]
+    )
+
+
+def plugged_in(group: str, name: str) -> Callable[..., Any] | None:
+    """What another package registered under an entry point: workbench computes, and who draws comes from outside."""
+    for entry in importlib.metadata.entry_points(group=group, name=name):
+        return entry.load()
+    return None
+
+
+# --- words
+
+
+def parsed(config_type: Any, program: str, words: Sequence[str]) -> Any:
+    """A config from words, by tyro.  Raises Unusable with one line where tyro would draw a box."""
+    import tyro
+
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(config_type, prog=program, args=list(words))
+    except SystemExit as end:
+        if not end.code:
+            raise _Helped from end
+        raise Unusable(f"{_unboxed(complaint.getvalue())} (see {program} --help)") from end
+
+
+class _Helped(SystemExit):
+    """tyro printed the help that was asked for."""
+
+
+def _unboxed(box: str) -> str:
+    """The words of tyro's box, up to its first rule."""
+    lines = []
+    for line in box.splitlines():
+        text = line.strip("│ ╭╮╰╯─")
+        if line.startswith("│") and not text:
+            break
+        if line.startswith("│"):
+            lines.append(text)
+    return " ".join(lines) or "the options cannot be used"
+
+
+def _with_json(config_type: Any) -> Any:
+    """The stage's own config, and `--json FILE` beside it."""
+    import tyro
+
+    json = Annotated[Path | None, tyro.conf.arg(help="Write the rows to this file, too.")]
+    config = tyro.conf.OmitArgPrefixes[config_type]
+    made = dataclasses.make_dataclass("Evaluate", [("config", config), ("json", json, None)], frozen=True)
+    made.__doc__ = config_type.__doc__
+    return made
+
+
+def _choice(program: str, label: str, choices: dict[str, Any], words: list[str]) -> tuple[str, list[str]]:
+    if words and words[0] in choices:
+        return words[0], words[1:]
+    if words and words[0] in ("-h", "--help"):
+        _say(f"usage: {program} {label} [OPTIONS]\n\n{label} is one of: {', '.join(choices)}")
+        raise _Helped(DONE)
+    got = repr(words[0]) if words else "nothing"
+    raise Unusable(f"{program} needs a {label}, one of {', '.join(choices)}; got {got}")
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        _say(usage())
+        return DONE
+    if words[0] == "--version":
+        _say(__version__)
+        return DONE
+    if words[0] not in COMMANDS:
+        raise Unusable(f"there is no command {words[0]!r}: workbench has {', '.join(COMMANDS)}")
+    try:
+        return COMMANDS[words[0]].run(words[1:])
+    except _Helped:
+        return DONE
+
+
+# --- what is said, and where
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+def _refuse(line: str) -> int:
+    sys.stderr.write(f"workbench: {line}\n")
+    return UNUSABLE
+
+
+def _tell_interrupted() -> int:
+    sys.stderr.write("workbench: interrupted\n")
+    return INTERRUPTED
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.strerror}: {error.filename}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _log_to_output() -> None:
+    """What is being done goes to the output, warnings to stderr, which stays clean otherwise."""
+    told, warned = logging.StreamHandler(sys.stdout), logging.StreamHandler(sys.stderr)
+    told.addFilter(lambda record: record.levelno < logging.WARNING)
+    warned.setLevel(logging.WARNING)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[told, warned], force=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
