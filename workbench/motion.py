@@ -123,11 +123,14 @@ class Motion:
                 rest_joints=torch.from_numpy(arrays["rest_joints"].astype(np.float32)),
             )
             quaternions = torch.from_numpy(arrays["quaternions"].astype(np.float64))
-            if quaternions.shape[-1:] != (4,):
+            translation = torch.from_numpy(arrays["translation"].astype(np.float32))
+            if quaternions.ndim != 3 or quaternions.shape[2] != 4:
                 raise ValueError(f"quaternions must be (T, J, 4), but are {tuple(quaternions.shape)}")
+            if tuple(translation.shape) != (len(quaternions), 3):
+                raise ValueError(f"translation must be ({len(quaternions)}, 3), but is {tuple(translation.shape)}")
             return Motion(
                 rotations=quaternion_to_matrix(quaternions).float(),
-                translation=torch.from_numpy(arrays["translation"].astype(np.float32)),
+                translation=translation,
                 fps=float(arrays["fps"]),
                 skeleton=skeleton,
                 name=str(arrays["name"]),
