@@ -4,8 +4,6 @@ Frames are ours (metres, z up) and are written as they are: a reader of the file
 """
 
 import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +12,11 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
 
+from workbench.npz import read_npz
 from workbench.store import atomic_write
 
 FPS = 30.0  # the paper's frame rate (section 6), for formats that hold none
+DRESSED_KEYS = ("body_vertices", "body_faces", "garment_vertices", "garment_faces")
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, sample rate, samples
 
 
@@ -150,7 +150,7 @@ def read_mesh_sequence(path: str | Path, fps: float | None = None) -> MeshSequen
     if path.suffix.lower() == ".pc2":
         return _read_pc2(path, FPS if fps is None else fps)
     if path.suffix.lower() == ".npz":
-        arrays = _read_npz(path)
+        arrays = read_npz(path, "a mesh sequence", required=("vertices", "faces"))
         return _sequence_of(path, arrays, "vertices", "faces", fps, path.stem)
     raise ValueError(f"{path} is no mesh sequence: expected a folder of .obj or .ply files, a .pc2 or an .npz")
 
@@ -233,9 +233,7 @@ def read_dressed_sequence(path: str | Path) -> DressedSequence:
     Raises FileNotFoundError, or ValueError when an array is absent, the frame counts differ or the file is damaged.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no sequence at {path}")
-    arrays = _read_npz(path)
+    arrays = read_npz(path, "a dressed sequence", required=DRESSED_KEYS)
     dressed = DressedSequence(
         _sequence_of(path, arrays, "body_vertices", "body_faces", None, "body"),
         _sequence_of(path, arrays, "garment_vertices", "garment_faces", None, "garment"),
@@ -259,21 +257,9 @@ def write_dressed_sequence(path: str | Path, dressed: DressedSequence, **more: n
         )
 
 
-def _read_npz(path: Path) -> dict[str, ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is not a readable npz of plain arrays ({error})") from error
-
-
 def _sequence_of(
     path: Path, arrays: dict[str, ndarray], vertices_key: str, faces_key: str, fps: float | None, name: str
 ) -> MeshSequence:
-    missing = [key for key in (vertices_key, faces_key) if key not in arrays]
-    if missing:
-        has = ", ".join(sorted(arrays)) or "nothing"
-        raise ValueError(f"{path} lacks {', '.join(missing)}: it has {has}")
     vertices, faces = arrays[vertices_key], arrays[faces_key]
     if vertices.ndim != 3 or vertices.shape[-1] != 3 or vertices.dtype.kind not in "fiu":
         raise ValueError(f"{path}: {vertices_key} is {vertices.dtype} {vertices.shape}, expected numbers (T, N, 3)")

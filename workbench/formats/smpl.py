@@ -7,8 +7,6 @@ because a forged dtype reads memory it should not.
 
 import io
 import pickle
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
 from scipy import sparse
+
+from workbench.npz import read_npz
 
 KEYS = ("v_template", "shapedirs", "posedirs", "weights", "J_regressor", "kintree_table", "f")
 
@@ -52,11 +52,8 @@ def read_smpl(path: str | Path) -> SmplArrays:
 
 
 def _read_npz(path: Path) -> dict[str, ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in KEYS if key in file.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is not a readable npz of plain arrays ({error})") from error
+    arrays = read_npz(path, "an SMPL-format body", required=KEYS)
+    return {key: arrays[key] for key in KEYS}
 
 
 def _read_pickle(path: Path) -> dict[str, ndarray]:
