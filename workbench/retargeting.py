@@ -21,7 +21,7 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
-from workbench.body.skinning import forward_kinematics, linear_blend
+from workbench.body.skinning import forward_kinematics
 from workbench.geometry.rotations import axis_angle_to_matrix, rotation_angle, smallest_rotation
 from workbench.motion import Motion
 
@@ -222,10 +222,10 @@ def reframed_skeleton(skeleton: Skeleton, turn: Float[Tensor, "3 3"], scale: flo
 
 
 def _snapped(direction: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """The coordinate axis nearest to a direction, or the direction itself if none is within 25 degrees."""
+    """The coordinate axis nearest to a direction, or the direction itself if none is within 12 degrees."""
     direction = direction / direction.norm()
     nearest = direction.abs().argmax()
-    if direction[nearest].abs() < 0.906:
+    if direction[nearest].abs() < 0.978:
         return direction
     return torch.eye(3, dtype=direction.dtype)[nearest] * direction[nearest].sign()
 
@@ -464,19 +464,22 @@ def _angle_between(a: Float[Tensor, "*#B 3"], b: Float[Tensor, "*#B 3"]) -> Floa
 # The floor
 
 
-def grounded(motion: Motion, body: Body, quantile: float = 0.1, frames: int = 400) -> Motion:
+def grounded(motion: Motion, body: Body, quantile: float = 0.1, frames: int = 200) -> Motion:
     """The motion lifted or lowered as a whole, so that the body's lowest point is at z = 0.
 
-    The lowest point is taken over every frame (or that many, evenly chosen), and the quantile of those heights goes to
+    The lowest point is taken in every frame (or in that many, evenly chosen), and the quantile of those heights goes to
     the floor: jumps do not pull it down, single slips of the capture below the floor do not lift it.
     """
     chosen = torch.linspace(0, len(motion) - 1, min(len(motion), frames)).long()
-    thinned = slice(None, None, max(1, len(body.template) // 2000))
-    pose = body.pose(motion.rotations[chosen], body.template.new_zeros(body.shape_count), motion.translation[chosen])
-    lowest = linear_blend(body.template[thinned], body.weights[thinned], pose.transforms)[..., 2].amin(-1)
-    return replace(
-        motion, translation=motion.translation - lowest.quantile(quantile) * lowest.new_tensor([0.0, 0.0, 1.0])
+    betas = body.template.new_zeros(body.shape_count)
+    lowest = torch.cat(
+        [
+            body.vertices(motion.rotations[part], betas, motion.translation[part])[..., 2].amin(-1)
+            for part in chosen.split(16)  # a few megabytes at a time
+        ]
     )
+    down = lowest.quantile(quantile) * lowest.new_tensor([0.0, 0.0, 1.0])
+    return replace(motion, translation=motion.translation - down)
 
 
 # The stage

@@ -32,7 +32,7 @@ vector = st.tuples(number, number, number).map(lambda v: torch.tensor(v, dtype=t
 
 
 def random_rotations(count=200, seed=0):
-    return torch.from_numpy(Rotation.random(count, random_state=np.random.default_rng(seed)).as_matrix())
+    return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(seed)).as_matrix())
 
 
 def test_axis_angle_agrees_with_scipy(rng):
