@@ -166,10 +166,10 @@ class Store:
         self,
         kind: str,
         config: Any,
-        write: Callable[[Path], None],
+        write: Callable[[Path], object],
         code: str = "",
         suffix: str = ".npz",
-        patience: float = -1,
+        patience: float = -1.0,
     ) -> Result:
         """The result, made by `write(path)` if it is not there; one process makes it, others wait for that one.
 
@@ -190,7 +190,7 @@ class Store:
 
 
 @contextlib.contextmanager
-def locked(path: str | Path, patience: float = -1) -> Iterator[None]:
+def locked(path: str | Path, patience: float = -1.0) -> Iterator[None]:
     """Hold the lock of `path`.  The system releases it when its holder dies, so a lock is never stale.
 
     Raises TimeoutError after `patience` seconds (-1: never).
