@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from workbench.body.model import body_from_arrays
 from workbench.body.skeleton import Skeleton
 from workbench.body.skinning import forward_kinematics
 from workbench.formats import load_motion
@@ -421,3 +422,42 @@ def test_an_npz_without_motion_is_named(body, tmp_path):
     np.savez(tmp_path / "mesh.npz", vertices=np.zeros((3, 3)))
     with pytest.raises(ValueError, match=r"mesh\.npz holds no motion.*but has vertices"):
         load_motion(tmp_path / "mesh.npz", body)
+
+
+def smpl_body():
+    """A body with SMPL's 24 joints and y-up rest, but nobody's shape: four vertices around each joint."""
+    generic = smpl_t_pose()
+    uneven = generic.rest_joints + 0.02 * torch.randn(22, 3, generator=torch.Generator().manual_seed(5))
+    places = torch.cat([uneven, uneven[20:] + torch.tensor([[0.08, 0.0, 0.0], [-0.08, 0.0, 0.0]])])
+    corners = 0.02 * torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-1.0, -1.0, -1.0]])
+    tetrahedron = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    return body_from_arrays(
+        {
+            "name": np.array("smpl"),
+            "template": (places[:, None] + corners).reshape(-1, 3).numpy(),
+            "shape_directions": np.zeros((1, 96, 3), np.float32),
+            "pose_directions": np.zeros((1, 96, 3), np.float32),
+            "pose_map": np.zeros((9 * 23, 1), np.float32),
+            "weights": np.eye(24, dtype=np.float32).repeat(4, axis=0),
+            "joint_template": places.numpy(),
+            "joint_directions": np.zeros((1, 24, 3), np.float32),
+            "faces": np.concatenate([tetrahedron + 4 * j for j in range(24)]),
+            "parents": np.array([*generic.parents, 20, 21]),
+            "joint_names": np.array([*generic.names, "left_hand", "right_hand"]),
+        }
+    )
+
+
+def test_amass_poses_are_an_smpl_body_s_own(tmp_path):
+    """On a body with SMPL's joints the file's rotations are used as they are; only the height changes."""
+    body = smpl_body()
+    rng = np.random.default_rng(2)
+    poses = 0.4 * rng.normal(size=(12, 72))
+    trans = rng.normal(size=(12, 3))
+    np.savez(tmp_path / "m.npz", poses=poses, trans=trans, mocap_framerate=np.array(60.0))
+    motion = load_motion(tmp_path / "m.npz", body, config=RetargetConfig(drop_t_pose=False))
+    expected = axis_angle_to_matrix(torch.from_numpy(poses).unflatten(1, (24, 3))).float()
+    torch.testing.assert_close(motion.rotations[:, :22], expected[:, :22], rtol=0, atol=1e-5)
+    shift = motion.translation - torch.from_numpy(trans).float()
+    torch.testing.assert_close(shift[:, :2], torch.zeros(12, 2), rtol=0, atol=1e-5)
+    torch.testing.assert_close(shift[:, 2], shift[:1, 2].expand(12), rtol=0, atol=1e-5)
