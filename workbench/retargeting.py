@@ -49,8 +49,8 @@ class RetargetConfig:
     T-pose still belong to the jump out of it; ours: people stay below 20.
     largest_twist: an elbow or knee axis further from the usual one than this is taken for noise, in degrees; ours.
     planted_speed: a foot slower than this stands, in leg lengths a second; ours: half a centimetre a frame at 30 fps.
-    largest_slope: standing feet whose soles slope more than this are meant so (toe stand), in degrees; ours: feet of the
-    four real clips slope by 2 to 7 and toes by up to 11, an error of their rest poses.
+    largest_slope: standing feet whose soles slope more than this are meant so (toe stand), in degrees; ours: feet of
+    the four real clips slope by 2 to 7 and toes by up to 11, an error of their rest poses.
     """
 
     world_up: Axis | None = None
