@@ -102,7 +102,8 @@ def describe(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [describe(entry) for entry in value]
     if type(value).__module__.partition(".")[0] == "torch":  # tensors, without importing torch
-        value = value.detach().cpu().numpy()
+        tensor: Any = value
+        value = tensor.detach().cpu().numpy()
     if isinstance(value, np.generic):
         return describe(value.item())
     if isinstance(value, np.ndarray) and value.dtype != object:
