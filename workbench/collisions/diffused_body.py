@@ -50,6 +50,14 @@ class FieldValues:
 
 
 @dataclass(frozen=True)
+class Rigging:
+    """What Eq. 7-8 need of the fields at points once beta and theta are known: W~, and B~s + B~p in metres."""
+
+    weights: Float[Tensor, "*B N J"]
+    offset: Float[Tensor, "*B N 3"]
+
+
+@dataclass(frozen=True)
 class FieldLayout:
     """How W~ (J), B~s (K x 3) and B~p (P x 3) lie side by side in one row of channels."""
 
@@ -93,6 +101,15 @@ class DiffusedFields(ABC):
     ) -> Float[Tensor, "*B N 3"]:
         """B~p(p, theta): corrective displacement for a pose, metres      (Eq. 6)"""
 
+    @abstractmethod
+    def rigging(
+        self,
+        points: Float[Tensor, "*B N 3"],
+        betas: Float[Tensor, "*B K"],
+        pose_coefficients: Float[Tensor, "*B P"],
+    ) -> Rigging:
+        """W~ and B~s + B~p together, the cheapest way; pose_coefficients = pose feature @ pose_map."""
+
 
 class LinearFields(DiffusedFields, ABC):
     """Fields that are linear in beta and the pose feature, as the body is: everything follows from `at`."""
@@ -108,6 +125,17 @@ class LinearFields(DiffusedFields, ABC):
     ) -> Float[Tensor, "*B N 3"]:
         coefficients = pose_feature @ self.pose_map
         return torch.einsum("...p,...npi->...ni", coefficients, self.at(points).pose_directions)
+
+    def rigging(
+        self,
+        points: Float[Tensor, "*B N 3"],
+        betas: Float[Tensor, "*B K"],
+        pose_coefficients: Float[Tensor, "*B P"],
+    ) -> Rigging:
+        values = self.at(points)
+        shape = torch.einsum("...k,...nki->...ni", betas, values.shape_directions)
+        pose = torch.einsum("...p,...npi->...ni", pose_coefficients, values.pose_directions)
+        return Rigging(values.weights, shape + pose)
 
 
 # The Monte-Carlo definition
@@ -271,7 +299,8 @@ class LearnedFields(DiffusedFields):
     def __init__(self, body: Body, *, width: int = 256, depth: int = 5, generator: torch.Generator | None = None):
         self.layout = FieldLayout.of(body)
         self.pose_map = body.pose_map
-        self.visible = body.pose_map @ torch.linalg.pinv(body.pose_map)
+        self.lift = torch.linalg.pinv(body.pose_map)  # the least pose feature with given coefficients
+        self.visible = body.pose_map @ self.lift
         self.low = body.template.amin(0) - BOX_MARGIN
         self.high = body.template.amax(0) + BOX_MARGIN
         self.fingerprint = body_fingerprint(body)
@@ -304,10 +333,19 @@ class LearnedFields(DiffusedFields):
         for unit in torch.eye(self.layout.shapes):
             betas = unit.expand(*lead, -1)
             shape.append((self.shape_offsets(points, betas) - self.shape_offsets(points, -betas)) / 2)
-        for feature in torch.linalg.pinv(self.pose_map):  # the least feature with this one coefficient
+        for feature in self.lift:
             feature = feature.expand(*lead, -1)
             pose.append((self.pose_offsets(points, feature) - self.pose_offsets(points, -feature)) / 2)
         return FieldValues(self.weights(points), torch.stack(shape, -2), torch.stack(pose, -2))
+
+    def rigging(
+        self,
+        points: Float[Tensor, "*B N 3"],
+        betas: Float[Tensor, "*B K"],
+        pose_coefficients: Float[Tensor, "*B P"],
+    ) -> Rigging:
+        feature = pose_coefficients @ self.lift
+        return Rigging(self.weights(points), self.shape_offsets(points, betas) + self.pose_offsets(points, feature))
 
     def networks(self) -> dict[str, MLP]:
         """The three networks by the name of their checkpoint file."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.body.skinning import RigidTransforms, blended_affine, dual_quaternion
-from workbench.collisions.diffused_body import DiffusedFields, FieldValues
+from workbench.collisions.diffused_body import DiffusedFields
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class GarmentModel:
 
     def local_map(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> LocalMap:
         """W~, B~s and B~p at X, contracted with beta and theta."""
-        values = self.fields.at(X)
-        rotation, translation = blended_affine(values.weights, state.transforms)
-        return LocalMap(rotation, translation, offsets(values, state))
+        rigging = self.fields.rigging(X, state.betas, state.pose_coefficients)
+        rotation, translation = blended_affine(rigging.weights, state.transforms)
+        return LocalMap(rotation, translation, rigging.offset)
 
     def unposed(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> Float[Tensor, "*B N 3"]:
         """T_G(X, beta, theta) = X + B~s(X, beta) + B~p(X, theta)      (Eq. 8)"""
-        return X + offsets(self.fields.at(X), state)
+        return X + self.fields.rigging(X, state.betas, state.pose_coefficients).offset
 
     def posed(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> Float[Tensor, "*B N 3"]:
         """M_G(X, beta, theta) = W(T_G, J(beta), theta, W~(X))      (Eq. 7)
@@ -95,16 +95,8 @@ class GarmentModel:
 
     def posed_by_dual_quaternions(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> Float[Tensor, "*B N 3"]:
         """Eq. 7 with W a dual-quaternion blend; B~p, fitted to linear blending, is left out."""
-        values = self.fields.at(X)
-        shape = torch.einsum("...k,...nki->...ni", state.betas, values.shape_directions)
-        return dual_quaternion(X + shape, values.weights, state.transforms)
-
-
-def offsets(values: FieldValues, state: BodyState) -> Float[Tensor, "*B N 3"]:
-    """B~s(X, beta) + B~p(X, theta): the diffused blendshapes of each point, in metres."""
-    shape = torch.einsum("...k,...nki->...ni", state.betas, values.shape_directions)
-    pose = torch.einsum("...p,...npi->...ni", state.pose_coefficients, values.pose_directions)
-    return shape + pose
+        rigging = self.fields.rigging(X, state.betas, torch.zeros_like(state.pose_coefficients))
+        return dual_quaternion(X + rigging.offset, rigging.weights, state.transforms)
 
 
 def _check_points(X: Tensor) -> None:

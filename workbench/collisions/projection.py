@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from workbench.body.skinning import blended_affine
 from workbench.collisions.body_sdf import BodySDF
-from workbench.collisions.garment_model import BodyState, GarmentModel, offsets
+from workbench.collisions.garment_model import BodyState, GarmentModel
 from workbench.geometry.strain import RestTriangles, deformation_gradient, green_strain
 
 Progress = Callable[[int], None]
@@ -197,17 +196,8 @@ class Projector:
         self, X: Float[Tensor, "P 3"], state: BodyState, frame: Int[Tensor, "P"]
     ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
         """T_G and M_G of loose points, each in its own frame."""
-        values = self.model.fields.at(X)
-        single = replace(
-            values,
-            weights=values.weights[:, None],
-            shape_directions=values.shape_directions[:, None],
-            pose_directions=values.pose_directions[:, None],
-        )
-        own = state[frame]
-        rotation, translation = blended_affine(single.weights, own.transforms)
-        unposed = X + offsets(single, own)[:, 0]
-        return unposed, (rotation[:, 0] @ unposed[..., None])[..., 0] + translation[:, 0]
+        local = self.model.local_map(X[:, None], state[frame])
+        return local.unposed(X[:, None])[:, 0], local.posed(X[:, None])[:, 0]
 
     def _check(self, garment: Tensor, state: BodyState) -> None:
         if garment.shape[-2] != len(self.template):

@@ -1,32 +1,45 @@
 """Fig. 3 b, c: the two unposings that Eq. 9 is held against.  M_G (T,N,3), beta, theta -> X (T,N,3)."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.body.skinning import blended_affine
-from workbench.collisions.diffused_body import FieldValues
-from workbench.collisions.garment_model import BodyState, LocalMap, offsets
+from workbench.collisions.diffused_body import Rigging
+from workbench.collisions.garment_model import BodyState, LocalMap
 from workbench.geometry.closest_point import ClosestPoint
 
 
-def surface_values(body: Body, points: Float[Tensor, "N 3"], surface: Float[Tensor, "V 3"]) -> FieldValues:
-    """Skinning weights and blendshapes of the nearest vertex of `surface` (a pose of the body) for each point."""
+@dataclass(frozen=True)
+class SurfaceRigging:
+    """Skinning weights and blendshape directions of body vertices, one for each garment vertex."""
+
+    weights: Float[Tensor, "N J"]
+    shape_directions: Float[Tensor, "K N 3"]
+    pose_directions: Float[Tensor, "P N 3"]
+
+    def at(self, state: BodyState) -> Rigging:
+        """Contracted with the beta and theta of one frame."""
+        shape = torch.einsum("k,kni->ni", state.betas, self.shape_directions)
+        pose = torch.einsum("p,pni->ni", state.pose_coefficients, self.pose_directions)
+        return Rigging(self.weights, shape + pose)
+
+
+def nearest_rigging(body: Body, points: Float[Tensor, "N 3"], surface: Float[Tensor, "V 3"]) -> SurfaceRigging:
+    """What the nearest vertex of `surface` (the body in some pose) has, for each point."""
     hit = ClosestPoint(surface.numpy(), body.faces.numpy()).query(points.numpy())
     corner = torch.from_numpy(hit.barycentric).argmax(dim=-1)
     nearest = body.faces[torch.from_numpy(hit.face).long(), corner]
-    return FieldValues(
-        body.weights[nearest],
-        body.shape_directions[:, nearest].movedim(0, 1),
-        body.pose_directions[:, nearest].movedim(0, 1),
-    )
+    return SurfaceRigging(body.weights[nearest], body.shape_directions[:, nearest], body.pose_directions[:, nearest])
 
 
-def unpose_with(values: FieldValues, garment: Float[Tensor, "N 3"], state: BodyState) -> Float[Tensor, "N 3"]:
-    """Inverse linear blend skinning with given values: A^-1 (M_G - t) - B~s - B~p."""
-    rotation, translation = blended_affine(values.weights, state.transforms)
-    local = LocalMap(rotation, translation, offsets(values, state))
+def unpose_with(rigging: Rigging, garment: Float[Tensor, "N 3"], state: BodyState) -> Float[Tensor, "N 3"]:
+    """Inverse linear blend skinning with a given rigging: A^-1 (M_G - t) - B_s - B_p."""
+    rotation, translation = blended_affine(rigging.weights, state.transforms)
+    local = LocalMap(rotation, translation, rigging.offset)
     return local.pulled_back(garment - translation) - local.offset
 
 
@@ -34,8 +47,9 @@ def constant_weights(
     body: Body, template: Float[Tensor, "N 3"], garment: Float[Tensor, "T N 3"], state: BodyState
 ) -> Float[Tensor, "T N 3"]:
     """Fig. 3 b: each vertex keeps the weights of the body vertex nearest to it in the template, in every frame."""
-    values = surface_values(body, template, body.template)
-    return torch.stack([unpose_with(values, target, state[frame]) for frame, target in enumerate(garment)])
+    rigging = nearest_rigging(body, template, body.template)
+    frames = [unpose_with(rigging.at(state[frame]), target, state[frame]) for frame, target in enumerate(garment)]
+    return torch.stack(frames)
 
 
 def nearest_weights(
@@ -47,7 +61,7 @@ def nearest_weights(
     """Fig. 3 c: each vertex takes, frame by frame, the weights of the posed body vertex nearest to it."""
     return torch.stack(
         [
-            unpose_with(surface_values(body, target, posed), target, state[frame])
+            unpose_with(nearest_rigging(body, target, posed).at(state[frame]), target, state[frame])
             for frame, (target, posed) in enumerate(zip(garment, posed_bodies, strict=True))
         ]
     )

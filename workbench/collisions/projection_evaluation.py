@@ -1,4 +1,4 @@
-"""`workbench evaluate projection`: Fig. 3 in figures.  simulated sequences, motions -> rows (ours, baselines, the floor)."""
+"""`workbench evaluate projection`: Fig. 3 in figures.  simulated sequences, motions -> rows."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator

@@ -1,8 +1,8 @@
-"""The floor under every canonical model (facts.md 9): re-posing a STATIC template already collides.  motions -> by region.
+"""The floor under every canonical model (facts.md 9): re-posing a STATIC template already collides.  motions -> shares.
 
 A canonical garment that touches nothing can end inside the posed body, because linear blending folds space where limbs
-close.  The floor is measured for a motion as it came, with its arms spread by a fixed angle (the usual preprocessing), and
-cleared of self-contact; no learning on canonical garments alone can go below it.
+close.  The floor is measured for a motion as it came, with its arms spread by a fixed angle (the usual preprocessing),
+and cleared of self-contact; no learning on canonical garments alone can go below it.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ FRAMES_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Floor:
-    """Share of the static template's vertices inside the posed body, 0..1: over all, by region, and self-overlap's part."""
+    """Shares of the static template's vertices inside the posed body, 0..1."""
 
     share: float
     overlap_share: float

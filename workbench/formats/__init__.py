@@ -1,6 +1,7 @@
 """Files of others, one format a module, and load_motion: any motion file -> Motion on a body's skeleton."""
 
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 
 import torch
@@ -12,7 +13,21 @@ from workbench.formats.bvh import read_bvh
 from workbench.motion import Motion, is_own_motion
 from workbench.retargeting import RetargetConfig, grounded, retarget
 
-__all__ = ["load_motion"]
+__all__ = ["load_motion", "motion_files"]
+
+SUFFIXES = (".bvh", ".npz")
+
+
+def motion_files(folder: Path | None = None) -> list[Path]:
+    """The motion files in a folder, sorted; without one, those that ship (generated, not yet cleared).
+
+    Raises ValueError where the folder has none.
+    """
+    folder = Path(str(resources.files("workbench") / "assets" / "motions")) if folder is None else folder
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    if not files:
+        raise ValueError(f"no motion files ({', '.join(SUFFIXES)}) in {folder}")
+    return files
 
 
 def load_motion(
