@@ -1,13 +1,15 @@
-"""facts 9: the least rotation that takes arms off the body.  theta (T,J,3,3), body, beta -> theta with 30 mm of clearance.
+"""facts 9: the least rotation that takes arms off the body.  theta (T,J,3,3), beta -> theta with 30 mm of clearance.
 
-Cloth cannot live where the body overlaps itself, so motion is made clear of the body before it is simulated or judged.
-Unknown is one small rotation x a limb and frame (three angles at the shoulder, the bend of the elbow; three at the hip):
+Cloth cannot live where the body overlaps itself, so motion is made clear of it before it is simulated or judged.
+Unknown is one small rotation x a limb and frame (three angles at the shoulder, the bend of the elbow; three at the
+hip):
 
     min_x  sum_t |x_t|^2 + (tau fps)^4 sum_t |x_(t-1) - 2 x_t + x_(t+1)|^2 + mu sum_i max(0, c_i + margin - d_i(x))^2
 
-d_i is the signed distance of sample i of the limb to the posed mesh of everything it must avoid, exact (closest point of
-the real triangles) and linearised; each round solves the convex piecewise quadratic program by active sets on a banded
-matrix.  c_i is the clearance, less where limb and body are neighbours already in the rest pose: near armpit and crotch.
+d_i is the signed distance of sample i of the limb to the posed mesh of everything it must avoid, exact (closest point
+of the real triangles) and linearised; each round solves the convex piecewise quadratic program by active sets on a
+banded matrix.  c_i is the clearance, less where limb and body are neighbours already in the rest pose: near armpit
+and crotch.
 Legs come first (each gives way to the other), then arms (to torso, head, legs and each other).
 
 Not handled: a forearm in its own upper arm, a thigh in the belly, the head in a shoulder.
@@ -28,6 +30,7 @@ from workbench.body.skinning import Pose, linear_blend
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.geometry.mesh import boundary_loops, vertex_normals
 from workbench.geometry.rotations import axis_angle_to_matrix
+from workbench.geometry.winding import winding_number
 from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
@@ -50,6 +53,7 @@ NAMES = (
     },
 )
 LIMBS = ("left arm", "right arm", "left leg", "right leg")
+DOUBTFUL_DEPTH = 0.01  # metres inside from which vertex normals are not believed: ours, measured
 CHUNK = 32  # frames posed at once: bounds the memory
 
 
@@ -69,7 +73,12 @@ class ClearingConfig:
     stiffness: float = 1e5  # mu, rad^2 / m^2: 1 mm of one sample weighs like 0.3 rad in one frame
     samples: int = 220  # a limb; spread evenly over its surface
     rounds: int = 14  # linearisations at most
-    step: float = 0.25  # radians a round at most
+    step: float = 0.2  # radians a round at most
+    damping: float = 1.0  # rad^-2: weight of a round's change beside |x|^2, against overshooting
+    settled: float = 0.02  # radians: clear and changing by less than this ends the rounds
+    most_arm: float = 75.0  # degrees about one axis; what would need more stays and is reported: ours
+    most_leg: float = 30.0
+    meeting_gap: int = 6  # frames apart up to which two contacts of the same limbs are one meeting
 
 
 @dataclass(frozen=True)
@@ -170,6 +179,7 @@ class Rows:
     distance: Float[np.ndarray, "N"]
     owed: Float[np.ndarray, "N"]
     whole: Bool[np.ndarray, "N"]  # the sample owes the whole clearance to torso or legs
+    exit: Float[np.ndarray, "N 3"]  # between the two limbs: the way the left one leaves, in the trunk's frame; else 0
 
 
 def clear(
@@ -239,23 +249,26 @@ class Stage:
         self.body, self.betas, self.limbs, self.core, self.config = body, betas, limbs, core, config
         self.smoothness = (config.smoothing * fps) ** 4
         self.freedoms = 3 if limbs[0].hinge is None else 4
+        self.most = np.deg2rad(config.most_leg if core is None else config.most_arm)
 
     def solve(self, rotations: Float[Tensor, "T J 3 3"]) -> tuple[Tensor, np.ndarray, State, State]:
         """(rotations, degrees added (T,2), state before, state after)."""
         T, D, config = len(rotations), 2 * self.freedoms, self.config
         bend = [_bend(rotations, self.body, limb) for limb in self.limbs]
         x = np.zeros((T, D))
-        rows = self.rows(rotations, x, bend, np.arange(T))
+        rows = self.rows(rotations, x, bend, np.arange(T), np.zeros((T, 3)))
         before = after = _state(rows, T)
         if (before.shortfall > config.tolerance).any():
-            best, best_worst = x, before
+            best, best_worst, least = x, before, np.inf
+            ways = _ways_out(rows, T, config)
             for _ in range(config.rounds):
-                x = _least_rotation(rows, x, self.smoothness, config)
-                rows = self.rows(rotations, x, bend, np.arange(T))
+                last, x = x, np.clip(_least_rotation(rows, x, self.smoothness, config), -self.most, self.most)
+                rows = self.rows(rotations, x, bend, np.arange(T), ways)
                 after = _state(rows, T)
-                if after.shortfall.sum() < best_worst.shortfall.sum():
-                    best, best_worst = x, after
-                if after.shortfall.max() <= 0.5 * config.tolerance:
+                change, cost = np.abs(x - last).max(), _cost(rows, x, self.smoothness, config)
+                if cost < least:
+                    best, best_worst, least = x, after, cost
+                if after.shortfall.max() <= 0.5 * config.tolerance and change < config.settled:
                     break
             x, after = best, best_worst
         turned = self.turned(rotations, x, bend) if np.any(x) else rotations
@@ -291,8 +304,9 @@ class Stage:
         x: Float[np.ndarray, "T D"],
         bend: Sequence["Bend | None"],
         frames: Int[np.ndarray, "S"],
+        ways: Float[np.ndarray, "T 3"],
     ) -> Rows:
-        """Distances of all samples and how they change with x, at these frames."""
+        """Distances of all samples and how they change with x, at these frames; ways: see `_ways_out`."""
         turned = self.turned(rotations, x, bend)
         found: list[Rows] = []
         for start in range(0, len(frames), CHUNK):
@@ -312,11 +326,11 @@ class Stage:
             if self.core is not None:
                 still = self.core.surface.points.posed(pose, coefficients).numpy()
                 found += self._core_rows(chunk, samples, still, levers, turns)
-            found += self._pair_rows(chunk, samples, surfaces, levers, turns)
+            found += self._pair_rows(chunk, samples, surfaces, levers, turns, ways)
         return Rows(
             *(
                 np.concatenate([getattr(rows, name) for rows in found])
-                for name in ("frame", "gradient", "distance", "owed", "whole")
+                for name in ("frame", "gradient", "distance", "owed", "whole", "exit")
             )
         )
 
@@ -348,7 +362,8 @@ class Stage:
                     s, points[part], hit.normal[part], self.limbs[k].by_root, self.limbs[k].by_hinge
                 )
             whole = ~head & (owed_trunk >= self.config.clearance)
-            found.append(Rows(np.full(len(points), frame), gradient, hit.distance, owed, whole))
+            none = np.zeros((len(points), 3))
+            found.append(Rows(np.full(len(points), frame), gradient, hit.distance, owed, whole, none))
         return found
 
     def _pair_rows(
@@ -358,8 +373,10 @@ class Stage:
         surfaces: Sequence[np.ndarray],
         levers: Sequence["Levers"],
         turns: Float[np.ndarray, "S J 3 3"],
+        ways: Float[np.ndarray, "T 3"],
     ) -> list[Rows]:
         """Samples of each limb against the other limb's mesh, which gives way too."""
+        trunk = self.body.parents[self.limbs[0].root]
         found = []
         meshes: dict[int, ClosestPoint] = {}
         for k in range(2):
@@ -377,6 +394,13 @@ class Stage:
                     meshes[k] = ClosestPoint(surface, other.part.faces)
                 points = points[near]
                 hit = _signed(meshes[k], other.part, other.surface, points, turns[s])
+                owed = limb.owed_to_other[near]
+                side = 1.0 if k == 0 else -1.0
+                leave = side * hit.normal @ turns[s, trunk]
+                # where limbs have gone through each other, nearest exits contradict: one way out a meeting
+                away = side * turns[s, trunk] @ ways[frame]
+                against = (hit.distance < owed) & (hit.normal @ away < 0.3) & bool(ways[frame].any())
+                hit.normal[against] = away
                 gradient = np.zeros((len(points), 2 * self.freedoms))
                 own = slice(k * self.freedoms, (k + 1) * self.freedoms)
                 theirs = slice((1 - k) * self.freedoms, (2 - k) * self.freedoms)
@@ -385,11 +409,13 @@ class Stage:
                 by_hinge = (other.surface_by_hinge[hit.vertices] * hit.share).sum(1)
                 gradient[:, theirs] = -levers[1 - k].gradient(s, hit.point, hit.normal, by_root, by_hinge)
                 none = np.zeros(len(points), bool)
-                found.append(Rows(np.full(len(points), frame), gradient, hit.distance, limb.owed_to_other[near], none))
+                found.append(
+                    Rows(np.full(len(points), frame), gradient, hit.distance, limb.owed_to_other[near], none, leave)
+                )
         if not found:
             D = 2 * self.freedoms
             empty = np.zeros(0)
-            found.append(Rows(np.zeros(0, int), np.zeros((0, D)), empty, empty, np.zeros(0, bool)))
+            found.append(Rows(np.zeros(0, int), np.zeros((0, D)), empty, empty, np.zeros(0, bool), np.zeros((0, 3))))
         return found
 
 
@@ -412,7 +438,9 @@ def _signed(
     points: Float[np.ndarray, "N 3"],
     turns: Float[np.ndarray, "J 3 3"],
 ) -> Hit:
-    """Signed distances; the side comes from the vertex normals, turned with the skin (smooth, and cheap)."""
+    """Signed distances.  Vertex normals, turned with the skin, say the side (cheap); where they say "deep inside",
+    which folds and sharp rims make them say wrongly, the exact winding number decides.
+    """
     near = mesh.query(points)
     corners = part.faces[near.face]
     normals = surface.normals[corners]
@@ -422,6 +450,9 @@ def _signed(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     away = points - near.point
     sign = np.where((away * normal).sum(1) < 0, -1.0, 1.0)
+    deep = np.flatnonzero((sign < 0) & (near.distance > DOUBTFUL_DEPTH))
+    if len(deep):
+        sign[deep] = np.where(winding_number(points[deep], mesh.vertices, part.faces) > 0.5, -1.0, 1.0)
     sure = near.distance > 1e-5
     direction = np.where(sure[:, None], sign[:, None] * away / np.maximum(near.distance, 1e-5)[:, None], normal)
     return Hit(near.face, near.point, sign * near.distance, direction, corners, near.barycentric)
@@ -515,11 +546,38 @@ def left_jacobian(w: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3 3"]:
     return np.eye(3) + first * K + second * (K @ K)
 
 
+def _ways_out(rows: Rows, frames: int, config: ClearingConfig) -> Float[np.ndarray, "T 3"]:
+    """The direction in which the left limb leaves the right one, one a meeting, in the trunk's frame; else 0.
+
+    The mean of the nearest exits by depth, with a leaning to the left: a limb that passes through another has exits on
+    both sides.
+    """
+    short = np.clip(rows.owed - rows.distance, 0, 0.05) * (np.abs(rows.exit).sum(1) > 0) * (rows.owed > 0)
+    total = np.stack([np.bincount(rows.frame, short * rows.exit[:, i], frames) for i in range(3)], 1)
+    weight = np.bincount(rows.frame, short, frames)
+    ways = np.zeros((frames, 3))
+    touching = np.flatnonzero(weight > 0)
+    for meeting in np.split(touching, np.flatnonzero(np.diff(touching) > config.meeting_gap) + 1):
+        if len(meeting):
+            way = total[meeting].sum(0) + 0.3 * weight[meeting].sum() * np.array([1.0, 0, 0])
+            first, last = max(0, meeting[0] - config.meeting_gap), meeting[-1] + config.meeting_gap + 1
+            ways[first:last] = way / (np.linalg.norm(way) + 1e-12)
+    return ways
+
+
 def _state(rows: Rows, frames: int) -> State:
     shortfall, distance = np.zeros(frames), np.full(frames, np.inf)
     np.maximum.at(shortfall, rows.frame, np.where(rows.owed > 0, rows.owed - rows.distance, 0.0))
     np.minimum.at(distance, rows.frame[rows.whole], rows.distance[rows.whole])
     return State(shortfall, distance)
+
+
+def _cost(rows: Rows, x: Float[np.ndarray, "T D"], smoothness: float, config: ClearingConfig) -> float:
+    """The sum in this file's first lines, with the distances as they are."""
+    rotation = (x**2).sum()
+    smooth = (np.diff(x, 2, axis=0) ** 2).sum()
+    short = np.maximum(0, rows.owed + config.margin - rows.distance)[rows.owed > 0]
+    return float(rotation + smoothness * smooth + config.stiffness * (short**2).sum())
 
 
 def _least_rotation(
@@ -532,6 +590,7 @@ def _least_rotation(
     frame, g, aim, distance = rows.frame[keep], rows.gradient[keep], aim[keep], rows.distance[keep]
     offset = distance - (g * x[frame]).sum(1)  # distance = offset + g . x
     base = _smooth_rotation_matrix(T, D, smoothness)
+    base[-1] += config.damping
     solution = x
     for _ in range(8):
         short = aim - offset - (g * solution[frame]).sum(1) > 0
@@ -546,11 +605,12 @@ def _least_rotation(
             for j in range(i, D):
                 # upper banded storage: entry (r, c) is at [bands + r - c, c]
                 matrix[2 * D + i - j, j::D] += blocks[:, i, j]
+        right += config.damping * x
         previous, solution = solution, solveh_banded(matrix, right.ravel()).reshape(T, D)
         if np.abs(solution - previous).max() < 1e-5:
             break
     longest = np.abs(solution - x).max(1, keepdims=True)
-    return x + (solution - x) * np.minimum(1, config.step / np.maximum(longest, 1e-9)).min()
+    return x + (solution - x) * np.minimum(1, config.step / np.maximum(longest, 1e-9))
 
 
 def _smooth_rotation_matrix(T: int, D: int, smoothness: float) -> Float[np.ndarray, "B N"]:
@@ -670,8 +730,8 @@ def _spread(points: Float[np.ndarray, "N 3"], allowed: Bool[np.ndarray, "N"], co
 def _check(motion: Motion, body: Body, betas: Tensor) -> None:
     if motion.skeleton.names != body.joint_names or motion.skeleton.parents != body.parents:
         raise ValueError(
-            f"motion {motion.name!r} has {len(motion.skeleton)} joints of another skeleton than the {len(body.parents)} of "
-            f"body '{body.name}'; retarget it first (workbench.formats.load_motion(path, body))"
+            f"motion {motion.name!r} has {len(motion.skeleton)} joints of another skeleton than the "
+            f"{len(body.parents)} of body '{body.name}'; retarget it first (workbench.formats.load_motion(path, body))"
         )
     if tuple(betas.shape) != (body.shape_count,):
         raise ValueError(
