@@ -56,13 +56,24 @@ class CompactGrid:
     made_for: str = ""
 
 
+@dataclass(frozen=True)
+class Leaf:
+    """Where points lie: corner nodes of their leaf cells and the corners' weights, local coordinates, edge length [m]."""
+
+    nodes: Int[Tensor, "N 8"]
+    weights: Float[Tensor, "N 8"]
+    local: Float[Tensor, "N 3"]
+    size: Float[Tensor, "N"]
+
+
 class FieldGrid:
     """The expanded table: for lookups.  Box and cells in metres; points outside take the value at the box's border."""
 
     def __init__(self, compact: CompactGrid):
         self.compact = compact
-        nodes, corners = _root(compact.shape)
-        values = compact.codes[0] * compact.step
+        _, corners = _root(compact.shape)
+        step = compact.step.astype(np.float32)
+        values = compact.codes[0].astype(np.float32) * step
         places = nodes_of_cells(compact.shape)
         children = [np.full(len(corners), -1, np.int32)]
         all_corners, first = [corners], 0
@@ -76,7 +87,7 @@ class FieldGrid:
                     f"level {level + 1} of the grid has {fine.free.sum()} free nodes, but "
                     f"{len(compact.codes[level + 1])} values"
                 )
-            added[fine.free] += compact.codes[level + 1] * compact.step
+            added[fine.free] += compact.codes[level + 1].astype(np.float32) * step
             next_first = first + len(places)
             children[level][split] = next_first + 8 * np.arange(split.sum(), dtype=np.int32)
             places, corners = split_cells(places[split], corners[split], len(values), fine)
@@ -85,8 +96,8 @@ class FieldGrid:
             all_corners.append(corners)
             first = next_first
         self.child = torch.from_numpy(np.concatenate(children))
-        self.corner = torch.from_numpy(np.concatenate(all_corners).astype(np.int32))
-        self.values = torch.from_numpy(values.astype(np.float32))
+        self.corner = torch.from_numpy(np.concatenate(all_corners))
+        self.values = torch.from_numpy(values)
         self.depth = len(compact.splits)
 
     @property
@@ -115,17 +126,13 @@ class FieldGrid:
         """Read what `save` wrote; ValueError for a missing, damaged or foreign file."""
         return FieldGrid(load_compact(path))
 
-    def locate(
-        self, points: Float[Tensor, "N 3"]
-    ) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-        """Leaf cell of each point, local coordinates in [0, 1]^3 and edge length: Warp in float32, torch otherwise."""
+    def locate(self, points: Float[Tensor, "N 3"]) -> "Leaf":
+        """The leaf cell of each point: by Warp for float32 on the CPU, by torch otherwise (two ways that agree)."""
         if points.dtype == torch.float32 and points.device.type == "cpu":
             return self._locate_by_warp(points)
         return self._locate_by_torch(points)
 
-    def _locate_by_torch(
-        self, points: Float[Tensor, "N 3"]
-    ) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    def _locate_by_torch(self, points: Float[Tensor, "N 3"]) -> "Leaf":
         shape = torch.tensor(self.compact.shape, device=points.device)
         x = (points - self.low.to(points)) / self.compact.root_size
         x = torch.minimum(x.clamp(min=0), shape.to(points))
@@ -142,25 +149,24 @@ class FieldGrid:
             cell = torch.where(deeper, down + (octant * digits).sum(1), cell)
             local = torch.where(deeper[:, None], 2 * local - octant, local)
             size = torch.where(deeper, size / 2, size)
-        return cell, local, size
+        return Leaf(self.corner.to(points.device)[cell], trilinear_weights(local), local, size)
 
-    def _locate_by_warp(
-        self, points: Float[Tensor, "N 3"]
-    ) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    def _locate_by_warp(self, points: Float[Tensor, "N 3"]) -> "Leaf":
         count = len(points)
-        cell, size = np.empty(count, np.int32), np.empty(count, np.float32)
-        local = np.empty((count, 3), np.float32)
+        nodes, weights = np.empty((count, 8), np.int32), np.empty((count, 8), np.float32)
+        local, size = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         if count:
             low, (nx, ny, nz) = self.compact.low, self.compact.shape
             inputs = [
-                wp.array(np.ascontiguousarray(points.numpy()), dtype=wp.vec3, device="cpu", copy=False),
+                _shared(np.ascontiguousarray(points.numpy()), wp.vec3),
                 wp.vec3(float(low[0]), float(low[1]), float(low[2])),
                 self.compact.root_size,
                 wp.vec3i(nx, ny, nz),
-                self._warp_child,
-                wp.array(cell, dtype=wp.int32, device="cpu", copy=False),
-                wp.array(local, dtype=wp.vec3, device="cpu", copy=False),
-                wp.array(size, dtype=wp.float32, device="cpu", copy=False),
+                *self._warp_tree,
+                _shared(nodes, wp.int32, 2),
+                _shared(weights, wp.float32, 2),
+                _shared(local, wp.vec3),
+                _shared(size, wp.float32),
             ]
 
             def launch(start: int, stop: int) -> None:
@@ -169,11 +175,11 @@ class FieldGrid:
                 )
 
             run_chunks(launch, count, chunk=1 << 15)
-        return torch.from_numpy(cell), torch.from_numpy(local), torch.from_numpy(size)
+        return Leaf(*(torch.from_numpy(array) for array in (nodes, weights, local, size)))
 
     @cached_property
-    def _warp_child(self) -> Any:
-        return wp.array(self.child.numpy(), dtype=wp.int32, device="cpu", copy=False)
+    def _warp_tree(self) -> Any:
+        return _shared(self.child.numpy(), wp.int32), _shared(self.corner.numpy(), wp.int32, 2)
 
     @cached_property
     def _double_values(self) -> Tensor:
@@ -188,11 +194,10 @@ class _Lookup(torch.autograd.Function):
         points = points.detach()
         if not bool(torch.isfinite(points).all()):
             raise ValueError(f"points must be finite, but {int((~torch.isfinite(points)).any(-1).sum())} are not")
-        cell, local, size = grid.locate(points)
-        nodes = grid.corner[cell]
-        ctx.save_for_backward(nodes, local, size, points)
+        leaf = grid.locate(points)
+        ctx.save_for_backward(leaf.nodes, leaf.local, leaf.size, points)
         ctx.grid = grid
-        return weighted_rows(_table(grid, points), nodes, trilinear_weights(local))
+        return weighted_rows(_table(grid, points), leaf.nodes, leaf.weights)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
@@ -208,6 +213,10 @@ class _Lookup(torch.autograd.Function):
         )
         outside = (points < grid.low.to(points)) | (points > grid.high.to(points))
         return gradient.masked_fill(outside, 0.0), None
+
+
+def _shared(array: np.ndarray, dtype: Any, ndim: int = 1) -> wp.array:
+    return wp.array(array, dtype=dtype, ndim=ndim, device="cpu", copy=False)
 
 
 def _table(grid: FieldGrid, points: Tensor) -> Tensor:
@@ -293,9 +302,9 @@ def tabulate(
     assert len(shape) == 3
     nodes, corners = _root(shape)
     exact = field((low + config.root_size * nodes).astype(np.float32))
-    step = quantisation.step.astype(np.float64)
+    step = quantisation.step.astype(np.float32)
     codes = [quantisation.encode(exact, np.zeros_like(exact))]
-    values = codes[0] * step
+    values = codes[0].astype(np.float32) * step
     places = nodes_of_cells(shape)
     ask = np.ones(len(places), bool)
     splits: list[np.ndarray] = []
@@ -312,7 +321,7 @@ def tabulate(
         known = exact[np.searchsorted(candidate.key, fine.key)]
         code = quantisation.encode(known[fine.free], interpolated[fine.free])
         added = interpolated
-        added[fine.free] += code * step
+        added[fine.free] += code.astype(np.float32) * step
         octants = _octant_errors(errors[split[ask]])
         ask = (octants > config.worth_asking).ravel()
         places, corners = split_cells(places[split], corners[split], len(values), fine)
@@ -337,21 +346,17 @@ def refine(
 ) -> Refinement:
     """The nodes that splitting the given cells of `level` adds.  places: cells' lower corners, in cells of that level."""
     extent = np.array(shape, np.int64) << (level + 1)  # of the box, in cells of the new level
+    stride = np.array([(extent[1] + 1) * (extent[2] + 1), extent[2] + 1, 1])
     lattice = LATTICE[IS_NEW]
-    place = (2 * places[:, None] + lattice).reshape(-1, 3).astype(np.int64)  # (m * 19, 3)
-    key, index, inverse, count = np.unique(
-        (place[:, 0] * (extent[1] + 1) + place[:, 1]) * (extent[2] + 1) + place[:, 2],
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
-    )
+    every = (2 * places @ stride)[:, None] + lattice @ stride
+    key, index, inverse, count = np.unique(every, return_index=True, return_inverse=True, return_counts=True)
     cell, which = np.divmod(index, len(lattice))
-    place = place[index]
+    place = np.stack([key // stride[0], key // stride[1] % (extent[1] + 1), key % (extent[2] + 1)], axis=1)
     # weights of the parent's corners at the lattice point: products of (1 - t, t) with t in {0, 1/2, 1}
-    t = lattice / 2
+    t = (lattice / 2).astype(np.float32)
     table = np.prod(np.where(CORNERS[None] == 1, t[:, None], 1 - t[:, None]), axis=-1)  # (19, 8)
     inner = (place > 0) & (place < extent)
-    around = np.prod(np.where((place % 2 == 0) & inner, 2, 1), axis=1)  # cells of `level` that touch the node
+    around = np.where((place % 2 == 0) & inner, 2, 1).prod(1)  # cells of `level` that touch the node
     return Refinement(
         key=key,
         place=place,
@@ -366,7 +371,7 @@ def split_cells(
     places: Int[np.ndarray, "m 3"], corners: Int[np.ndarray, "m 8"], node_count: int, fine: Refinement
 ) -> tuple[Int[np.ndarray, "c 3"], Int[np.ndarray, "c 8"]]:
     """The eight children of each cell, in the order of CORNERS: their places and corner nodes."""
-    nodes = np.empty((len(places), 27), np.int64)
+    nodes = np.empty((len(places), 27), np.int32)
     nodes[:, IS_NEW] = node_count + fine.node_of
     nodes[:, ~IS_NEW] = corners
     positions = CORNERS[:, None] + CORNERS[None]  # (child, corner, axis) on the 3 x 3 x 3 lattice
@@ -377,9 +382,8 @@ def split_cells(
 def interpolate(
     values: Float[np.ndarray, "n C"], nodes: Int[np.ndarray, "m 8"], weights: Float[np.ndarray, "m 8"]
 ) -> Float[np.ndarray, "m C"]:
-    """sum_k weights[m,k] values[nodes[m,k]] in double precision."""
-    rows, table = torch.from_numpy(nodes), torch.from_numpy(values)
-    return F.embedding_bag(rows, table, per_sample_weights=torch.from_numpy(weights), mode="sum").numpy()
+    """sum_k weights[m,k] values[nodes[m,k]]"""
+    return weighted_rows(*(torch.from_numpy(array) for array in (values, nodes, weights))).numpy()
 
 
 def nodes_of_cells(shape: tuple[int, int, int]) -> Int[np.ndarray, "m 3"]:
@@ -392,7 +396,7 @@ def _root(shape: tuple[int, int, int]) -> tuple[Int[np.ndarray, "n 3"], Int[np.n
     nx, ny, nz = (n + 1 for n in shape)
     nodes = nodes_of_cells((nx, ny, nz))
     corner = nodes_of_cells(shape)[:, None] + CORNERS
-    return nodes, (corner[..., 0] * ny + corner[..., 1]) * nz + corner[..., 2]
+    return nodes, ((corner[..., 0] * ny + corner[..., 1]) * nz + corner[..., 2]).astype(np.int32)
 
 
 # On disk

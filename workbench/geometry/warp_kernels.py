@@ -133,11 +133,14 @@ def locate_in_octree(
     root_size: float,
     shape: wp.vec3i,
     child: wp.array(dtype=wp.int32),
-    cell: wp.array(dtype=wp.int32),
+    corner: wp.array2d(dtype=wp.int32),
+    nodes: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.float32),
     local: wp.array(dtype=wp.vec3),
     size: wp.array(dtype=wp.float32),
 ):
-    """The leaf cell that holds each point (clamped to the box), its edge, and where in it, in [0, 1]^3."""
+    """The corner nodes of the leaf cell that holds each point (clamped to the box), their trilinear weights, the local
+    coordinates in [0, 1]^3 and the cell's edge."""
     n = start + wp.tid()
     x = (points[n] - low) / root_size
     u = wp.vec3(0.0, 0.0, 0.0)
@@ -159,6 +162,18 @@ def locate_in_octree(
         index = down + octant
         edge = 0.5 * edge
         down = child[index]
-    cell[n] = index
+    for k in range(8):
+        nodes[n, k] = corner[index, k]
+    lx = 1.0 - u[0]
+    ly = 1.0 - u[1]
+    lz = 1.0 - u[2]
+    weights[n, 0] = lx * ly * lz
+    weights[n, 1] = lx * ly * u[2]
+    weights[n, 2] = lx * u[1] * lz
+    weights[n, 3] = lx * u[1] * u[2]
+    weights[n, 4] = u[0] * ly * lz
+    weights[n, 5] = u[0] * ly * u[2]
+    weights[n, 6] = u[0] * u[1] * lz
+    weights[n, 7] = u[0] * u[1] * u[2]
     local[n] = u
     size[n] = edge
