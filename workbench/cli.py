@@ -8,7 +8,9 @@ import dataclasses
 import importlib
 import importlib.metadata
 import io
+import itertools
 import logging
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -16,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from workbench import __version__
-from workbench.extras import MissingExtra
+from workbench.extras import missing_extra
 
 DONE, INTERNAL, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 OURS = ("workbench", "widgets", "assets_gen")
@@ -37,16 +39,23 @@ class Unusable(Exception):
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if words is None else words)
+    return ended(lambda: _dispatch(words), "workbench")
+
+
+def ended(command: Callable[[], int], program: str) -> int:
+    """Run `command` and turn however it ends into an exit status and what stderr says."""
     _log_to_output()
     try:
-        return _dispatch(words)
-    except Unusable as error:
-        return _refuse(str(error))
+        return command()
+    except Helped:
+        return DONE
     except KeyboardInterrupt:
-        return _tell_interrupted()
-    except Exception as error:  # noqa: BLE001  the outermost border: unusable input ends in a line, a fault of ours in a traceback
+        sys.stderr.write(f"{program}: interrupted\n")
+        return INTERRUPTED
+    except Exception as error:  # noqa: BLE001  the outermost border: unusable input ends in a line, our faults in a traceback
         if is_unusable_input(error):
-            return _refuse(_one_line(error))
+            sys.stderr.write(f"{program}: {_one_line(error)}\n")
+            return UNUSABLE
         traceback.print_exc()
         return INTERNAL
 
@@ -56,8 +65,10 @@ def is_unusable_input(error: BaseException) -> bool:
 
     A ValueError from inside a library is a fault of ours: it should have been checked at the border.
     """
-    if isinstance(error, MissingExtra | FileNotFoundError | NotADirectoryError | IsADirectoryError | PermissionError):
+    if isinstance(error, Unusable | FileNotFoundError | NotADirectoryError | IsADirectoryError | PermissionError):
         return True
+    if isinstance(error, ImportError):
+        return missing_extra(error) is not None
     if not isinstance(error, ValueError):
         return False
     frames = list(traceback.walk_tb(error.__traceback__))
@@ -73,26 +84,26 @@ def demo(words: list[str]) -> int:
     config = parsed(DemoConfig, "workbench demo", words)
     picture = plugged_in("workbench.pictures", "demo")
     run(config, picture=picture)
-    _say(f"written: {', '.join(str(path) for path in sorted(config.out.glob('*')))}")
+    say(f"written: {', '.join(str(path) for path in sorted(config.out.glob('*')))}")
     return DONE
 
 
 def evaluate(words: list[str]) -> int:
-    name, rest = _choice("workbench evaluate", "NAME", EVALUATIONS, words)
+    name, rest = choice("workbench evaluate", "NAME", EVALUATIONS, words)
     module_name, config_name = EVALUATIONS[name]
     module = importlib.import_module(module_name)
     from workbench.evaluation_table import format_table, write_json
 
     options = parsed(_with_json(getattr(module, config_name)), f"workbench evaluate {name}", rest)
     rows = module.rows(options.config)
-    _say(format_table(rows))
+    say(format_table(rows))
     if options.json is not None:
         write_json(options.json, name, rows)
     return DONE
 
 
 def train(words: list[str]) -> int:
-    stage, rest = _choice("workbench train", "STAGE", TRAININGS, words)
+    stage, rest = choice("workbench train", "STAGE", TRAININGS, words)
     module_name, config_name = TRAININGS[stage]
     module = importlib.import_module(module_name)
     module.run(parsed(getattr(module, config_name), f"workbench train {stage}", rest))
@@ -103,7 +114,7 @@ def export(words: list[str]) -> int:
     from workbench.export import ExportConfig, run
 
     written = run(parsed(ExportConfig, "workbench export", words))
-    _say(f"written: {', '.join(map(str, written))}")
+    say(f"written: {', '.join(map(str, written))}")
     return DONE
 
 
@@ -111,11 +122,11 @@ def doctor(words: list[str]) -> int:
     from workbench import doctor as machine
 
     if words and words[0] in ("-h", "--help"):
-        _say("usage: workbench doctor\n\nWhat this machine has and lacks, with the one command that mends it.")
+        say("usage: workbench doctor\n\nWhat this machine has and lacks, with the one command that mends it.")
         return DONE
     if words:
         raise Unusable(f"workbench doctor takes no options, got {' '.join(words)!r}")
-    _say(machine.report(machine.run()))
+    say(machine.report(machine.run()))
     return DONE
 
 
@@ -167,24 +178,24 @@ def parsed(config_type: Any, program: str, words: Sequence[str]) -> Any:
             return tyro.cli(config_type, prog=program, args=list(words))
     except SystemExit as end:
         if not end.code:
-            raise _Helped from end
+            raise Helped from end
         raise Unusable(f"{_unboxed(complaint.getvalue())} (see {program} --help)") from end
 
 
-class _Helped(SystemExit):
-    """tyro printed the help that was asked for."""
+class Helped(Exception):
+    """The help that was asked for has been printed."""
 
 
 def _unboxed(box: str) -> str:
-    """The words of tyro's box, up to its first rule."""
-    lines = []
-    for line in box.splitlines():
-        text = line.strip("│ ╭╮╰╯─")
-        if line.startswith("│") and not text:
-            break
-        if line.startswith("│"):
-            lines.append(text)
-    return " ".join(lines) or "the options cannot be used"
+    """The words of tyro's box, below its title and up to its first rule; how it is drawn varies with the terminal."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    _, *lines = [line.strip("│╭╮╰╯ ") for line in plain.splitlines()] or [""]
+    words = itertools.dropwhile(_is_rule, lines)
+    return " ".join(itertools.takewhile(lambda line: not _is_rule(line), words)) or "the options cannot be used"
+
+
+def _is_rule(line: str) -> bool:
+    return not line.strip("─- ")
 
 
 def _with_json(config_type: Any) -> Any:
@@ -198,49 +209,38 @@ def _with_json(config_type: Any) -> Any:
     return made
 
 
-def _choice(program: str, label: str, choices: dict[str, Any], words: list[str]) -> tuple[str, list[str]]:
+def choice(program: str, label: str, choices: dict[str, Any], words: list[str]) -> tuple[str, list[str]]:
     if words and words[0] in choices:
         return words[0], words[1:]
     if words and words[0] in ("-h", "--help"):
-        _say(f"usage: {program} {label} [OPTIONS]\n\n{label} is one of: {', '.join(choices)}")
-        raise _Helped(DONE)
+        say(f"usage: {program} {label} [OPTIONS]\n\n{label} is one of: {', '.join(choices)}")
+        raise Helped
     got = repr(words[0]) if words else "nothing"
     raise Unusable(f"{program} needs a {label}, one of {', '.join(choices)}; got {got}")
 
 
 def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
-        _say(usage())
+        say(usage())
         return DONE
     if words[0] == "--version":
-        _say(__version__)
+        say(__version__)
         return DONE
     if words[0] not in COMMANDS:
         raise Unusable(f"there is no command {words[0]!r}: workbench has {', '.join(COMMANDS)}")
-    try:
-        return COMMANDS[words[0]].run(words[1:])
-    except _Helped:
-        return DONE
+    return COMMANDS[words[0]].run(words[1:])
 
 
 # --- what is said, and where
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
-def _refuse(line: str) -> int:
-    sys.stderr.write(f"workbench: {line}\n")
-    return UNUSABLE
-
-
-def _tell_interrupted() -> int:
-    sys.stderr.write("workbench: interrupted\n")
-    return INTERRUPTED
-
-
 def _one_line(error: BaseException) -> str:
+    if isinstance(error, ImportError):
+        error = missing_extra(error) or error
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.strerror}: {error.filename}"
     return " ".join(str(error).split()) or type(error).__name__

@@ -19,6 +19,25 @@ def install_command(extra: str) -> str:
     return f"pip install 'garment-workbench[{extra}]'"
 
 
+def missing_extra(error: ImportError) -> MissingExtra | None:
+    """The missing extra behind a failed import, or None when it is something else that failed."""
+    if isinstance(error, MissingExtra):
+        return error
+    package = (error.name or "").partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError):
+        return None
+    for extra, modules in EXTRAS.items():
+        if package in modules:
+            return _missing(package, extra)
+    return None
+
+
+def _missing(package: str, extra: str) -> MissingExtra:
+    return MissingExtra(
+        f"this needs the package {package!r}, which is not installed: run {install_command(extra)}", name=package
+    )
+
+
 def require(module: str, extra: str) -> ModuleType:
     """Import `module`, which the extra `extra` brings.
 
@@ -33,6 +52,4 @@ def require(module: str, extra: str) -> ModuleType:
         package = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != package:
             raise
-        raise MissingExtra(
-            f"this needs the package {package!r}, which is not installed: run {install_command(extra)}", name=package
-        ) from error
+        raise _missing(package, extra) from error
