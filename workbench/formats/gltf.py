@@ -1,11 +1,11 @@
 """Moving meshes  <->  one animated .glb (glTF 2.0) that Blender, three.js and any glTF viewer play.
 
 Every frame is a morph target, switched on and off by linearly interpolated weights, so a viewer shows exactly our
-vertices at each frame and their straight-line blend between frames.  Skinning would be smaller, but viewers built on
+vertices at each frame and their blend between frames.  Skinning would be smaller, but viewers built on
 three.js take four joints a vertex and the body has up to seven: its surface would leave the garment.  Weights stay in
 [0, 1], because Blender clamps the others.
 
-The rigid part of each mesh's motion moves its node; the rest is stored as whole numbers (KHR_mesh_quantization):
+The rigid part of the common motion moves one node; the rest is stored as whole numbers (KHR_mesh_quantization):
 positions of 16 bits, a step of some 0.03 mm, and normals of 8.  A stored difference reaches one and a normal that turns
 over needs two, so one more target, always on, takes the base's normals away, and each frame brings its own.
 """
@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from workbench.formats.mesh_sequence import MeshSequence
+from workbench.formats.mesh_sequence import FPS, MeshSequence
 from workbench.store import atomic_write
 
 Colour = tuple[float, float, float]  # linear red, green, blue in [0, 1]
@@ -33,6 +33,7 @@ CLOTH: Colour = (0.10, 0.26, 0.52)
 ENCODINGS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
+FIGURE = 1  # the node that carries all meshes
 # glTF is y up: (x, y, z) -> (x, z, -y), so that the body, which faces our -y, faces glTF's +z
 Y_UP = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # x, y, z, w
 
@@ -67,7 +68,8 @@ def write_glb(path: str | Path, meshes: Sequence[GltfMesh]) -> None:
     rates = {mesh.sequence.fps for mesh in meshes}
     if len(rates) != 1 or min(rates) <= 0:
         raise ValueError(f"meshes that move together need one positive frame rate, got {sorted(rates)}")
-    document = _Document(frames.pop(), rates.pop())
+    together = np.concatenate([mesh.sequence.vertices for mesh in meshes], axis=1)
+    document = _Document(rigid_motion(together), rates.pop())
     for mesh in meshes:
         document.add(mesh)
     with atomic_write(path) as part:
@@ -122,8 +124,10 @@ def continuous_quaternions(rotation: Float[ndarray, "T 3 3"]) -> Float[ndarray, 
 class _Document:
     """glTF's JSON and its one binary buffer, as they grow."""
 
-    def __init__(self, frames: int, fps: float):
-        self.frames = frames
+    def __init__(self, rigid: RigidMotion, fps: float):
+        self.rigid = rigid
+        self.frames = len(rigid.centre)
+        quaternions = continuous_quaternions(rigid.rotation)
         self.binary = bytearray()
         self.json: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "garment-workbench"},
@@ -131,7 +135,15 @@ class _Document:
             "extensionsRequired": ["KHR_mesh_quantization"],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"name": "z up", "rotation": [float(q) for q in Y_UP], "children": []}],
+            "nodes": [
+                {"name": "z up", "rotation": [float(q) for q in Y_UP], "children": [FIGURE]},
+                {
+                    "name": "figure",
+                    "translation": rigid.centre[0].tolist(),
+                    "rotation": quaternions[0].tolist(),
+                    "children": [],
+                },
+            ],
             "meshes": [],
             "materials": [],
             "accessors": [],
@@ -139,13 +151,16 @@ class _Document:
         }
         self.channels: list[dict[str, Any]] = []
         self.samplers: list[dict[str, Any]] = []
-        times = np.arange(frames, dtype=np.float32) / np.float32(fps)
-        self.times = self._numbers(times, "SCALAR", bounds=True) if frames > 1 else None
+        self.times: int | None = None
+        if self.frames > 1:
+            times = np.arange(self.frames, dtype=np.float32) / np.float32(fps)
+            self.times = self._numbers(times, "SCALAR", bounds=True)
+            self._animate(FIGURE, "translation", rigid.centre.astype(np.float32), "VEC3")
+            self._animate(FIGURE, "rotation", quaternions.astype(np.float32), "VEC4")
 
     def add(self, mesh: GltfMesh) -> None:
         sequence = mesh.sequence
-        rigid = rigid_motion(sequence.vertices)
-        local = np.einsum("tij,tni->tnj", rigid.rotation, sequence.vertices - rigid.centre[:, None])
+        local = np.einsum("tij,tni->tnj", self.rigid.rotation, sequence.vertices - self.rigid.centre[:, None])
         deltas = local - local[0]
         scale = float(max(np.abs(local[0]).max(), np.abs(deltas).max(), 1e-6))
         base = {"POSITION": self._vertices(_quantised(local[0] / scale, 16), bounds=True)}
@@ -174,22 +189,14 @@ class _Document:
         if targets:
             primitive["targets"] = targets
             shape |= {"weights": [0.0] * len(targets), "extras": {"targetNames": names}}
-        quaternions = continuous_quaternions(rigid.rotation)
-        node = {
-            "name": sequence.name,
-            "mesh": len(self.json["meshes"]),
-            "translation": [float(x) for x in rigid.centre[0]],
-            "rotation": [float(x) for x in quaternions[0]],
-            "scale": [scale] * 3,
-        }
+        node = {"name": sequence.name, "mesh": len(self.json["meshes"]), "scale": [scale] * 3}
         self.json["materials"].append(_material(mesh))
         self.json["meshes"].append(shape)
         self.json["nodes"].append(node)
-        self.json["nodes"][0]["children"].append(len(self.json["nodes"]) - 1)
-        if self.times is not None:
-            self._animate("weights", weights.ravel(), "SCALAR")
-            self._animate("translation", rigid.centre.astype(np.float32), "VEC3")
-            self._animate("rotation", quaternions.astype(np.float32), "VEC4")
+        index = len(self.json["nodes"]) - 1
+        self.json["nodes"][FIGURE]["children"].append(index)
+        if targets:
+            self._animate(index, "weights", weights.ravel(), "SCALAR")
 
     def glb(self) -> bytes:
         if self.channels:
@@ -201,10 +208,8 @@ class _Document:
         chunks += struct.pack("<I4s", len(self.binary), b"BIN\0") + bytes(self.binary)
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
-    def _animate(self, path: str, values: ndarray, kind: str) -> None:
-        self.channels.append(
-            {"sampler": len(self.samplers), "target": {"node": len(self.json["nodes"]) - 1, "path": path}}
-        )
+    def _animate(self, node: int, path: str, values: ndarray, kind: str) -> None:
+        self.channels.append({"sampler": len(self.samplers), "target": {"node": node, "path": path}})
         output = self._numbers(values, kind)
         self.samplers.append({"input": self.times, "output": output, "interpolation": "LINEAR"})
 
@@ -303,17 +308,17 @@ class _GlbReader:
         primitive = self.json["meshes"][node["mesh"]]["primitives"][0]
         first = self._array(primitive["attributes"]["POSITION"])
         deltas = [self._array(target["POSITION"]) for target in primitive.get("targets", [])]
-        animated = self._channels(index)
-        frames = len(animated["translation"]) if animated else 1
-        translation = animated.get("translation", np.array([node["translation"]]))
-        rotation = Rotation.from_quat(animated.get("rotation", np.array([node["rotation"]]))).as_matrix()
-        local = np.repeat(first[None], frames, axis=0)
+        figure, moved, shaped = self.json["nodes"][FIGURE], self._channels(FIGURE), self._channels(index)
+        translation = moved.get("translation", np.array([figure["translation"]]))
+        rotation = Rotation.from_quat(moved.get("rotation", np.array([figure["rotation"]]))).as_matrix()
+        local = np.repeat(first[None], len(translation), axis=0)
         if deltas:
-            local += np.einsum("tk,kni->tni", animated["weights"].reshape(frames, -1), np.stack(deltas))
+            weights = shaped["weights"].reshape(len(translation), -1)
+            local += np.einsum("tk,kni->tni", weights, np.stack(deltas))
         vertices = np.einsum("tij,tnj->tni", rotation, local * node["scale"][0]) + translation[:, None]
         faces = self._array(primitive["indices"]).reshape(-1, 3).astype(np.int64)
-        times = animated.get("times", np.zeros(1))
-        fps = float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 else 30.0
+        times = moved.get("times", np.zeros(1))
+        fps = float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 else FPS
         return MeshSequence(vertices.astype(np.float32), faces, fps, node["name"])
 
     def _channels(self, index: int) -> dict[str, ndarray]:
