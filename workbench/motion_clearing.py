@@ -17,7 +17,7 @@ Not handled: a forearm in its own upper arm, a thigh in the belly, the head in a
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -53,6 +53,7 @@ NAMES = (
     },
 )
 LIMBS = ("left arm", "right arm", "left leg", "right leg")
+REACH = 0.15  # metres: what is farther off is not looked at
 DOUBTFUL_DEPTH = 0.01  # metres inside from which vertex normals are not believed: ours, measured
 CHUNK = 32  # frames posed at once: bounds the memory
 
@@ -67,7 +68,7 @@ class ClearingConfig:
     far: float = 0.12  # and from which it owes the whole clearance; linear in between
     leg_near: float = 0.03  # the same between the legs (crotch)
     leg_far: float = 0.08
-    smoothing: float = 0.12  # seconds tau: a lone bump of contact is spread over about 4 tau: ours
+    smoothing: float = 0.08  # seconds tau: giving way starts about 4 tau before contact: ours, see the strips
     margin: float = 0.0015  # metres aimed at beyond what is owed, against the gaps between samples
     tolerance: float = 0.001  # metres short of what is owed that still count as clear
     stiffness: float = 1e5  # mu, rad^2 / m^2: 1 mm of one sample weighs like 0.3 rad in one frame
@@ -89,7 +90,9 @@ class ClearedMotion:
     added: Float[np.ndarray, "T 4"]  # degrees of rotation added
     shortfall_before: Float[np.ndarray, "T"]  # metres that the worst sample lacks of what it owes; 0 where clear
     shortfall_after: Float[np.ndarray, "T"]
-    distance_before: Float[np.ndarray, "T"]  # metres, least signed distance of an arm's samples that owe the whole
+    distance_before: Float[
+        np.ndarray, "T"
+    ]  # metres, least signed distance (at most REACH) of arm samples that owe the whole
     distance_after: Float[np.ndarray, "T"]  # clearance to torso and legs; negative inside
     unresolved: Bool[np.ndarray, "T"]  # frames still short by more than the tolerance
 
@@ -248,6 +251,7 @@ class Stage:
     ):
         self.body, self.betas, self.limbs, self.core, self.config = body, betas, limbs, core, config
         self.smoothness = (config.smoothing * fps) ** 4
+        self.still: dict[int, np.ndarray] = {}  # the core as last posed, by first frame of the chunk
         self.freedoms = 3 if limbs[0].hinge is None else 4
         self.most = np.deg2rad(config.most_leg if core is None else config.most_arm)
 
@@ -256,21 +260,28 @@ class Stage:
         T, D, config = len(rotations), 2 * self.freedoms, self.config
         bend = [_bend(rotations, self.body, limb) for limb in self.limbs]
         x = np.zeros((T, D))
-        rows = self.rows(rotations, x, bend, np.arange(T), np.zeros((T, 3)))
+        rows = self.rows(rotations, x, bend, np.zeros((T, 3)))
         before = after = _state(rows, T)
         if (before.shortfall > config.tolerance).any():
-            best, best_worst, least = x, before, np.inf
+            best, best_state, least = x, before, np.inf
             ways = _ways_out(rows, T, config)
-            for _ in range(config.rounds):
+            for turn in range(config.rounds):
                 last, x = x, np.clip(_least_rotation(rows, x, self.smoothness, config), -self.most, self.most)
-                rows = self.rows(rotations, x, bend, np.arange(T), ways)
-                after = _state(rows, T)
-                change, cost = np.abs(x - last).max(), _cost(rows, x, self.smoothness, config)
-                if cost < least:
-                    best, best_worst, least = x, after, cost
-                if after.shortfall.max() <= 0.5 * config.tolerance and change < config.settled:
+                fresh = turn % 4 == 3 or turn == config.rounds - 1
+                rows = self.rows(rotations, x, bend, ways, fresh=fresh)
+                state = _state(rows, T)
+                done = state.shortfall.max() <= 0.5 * config.tolerance and np.abs(x - last).max() < config.settled
+                if done and not fresh:
+                    fresh, rows = True, self.rows(rotations, x, bend, ways)
+                    state = _state(rows, T)
+                    done = state.shortfall.max() <= 0.5 * config.tolerance
+                cost = _cost(rows, x, self.smoothness, config)
+                if fresh and cost < least:
+                    best, best_state, least = x, state, cost
+                if done:
                     break
-            x, after = best, best_worst
+            x, after = best, best_state
+        self.still.clear()
         turned = self.turned(rotations, x, bend) if np.any(x) else rotations
         return turned, self.degrees(x, bend), before, after
 
@@ -303,19 +314,22 @@ class Stage:
         rotations: Float[Tensor, "T J 3 3"],
         x: Float[np.ndarray, "T D"],
         bend: Sequence["Bend | None"],
-        frames: Int[np.ndarray, "S"],
         ways: Float[np.ndarray, "T 3"],
+        *,
+        fresh: bool = True,
     ) -> Rows:
-        """Distances of all samples and how they change with x, at these frames; ways: see `_ways_out`."""
+        """Distances of all samples nearer than REACH and how they change with x; ways: see `_ways_out`.
+
+        fresh: pose the core anew (turning arms hardly moves it); False takes it from the last call.
+        """
         turned = self.turned(rotations, x, bend)
         found: list[Rows] = []
-        for start in range(0, len(frames), CHUNK):
-            chunk = frames[start : start + CHUNK]
+        for start in range(0, len(x), CHUNK):
+            chunk = np.arange(start, min(start + CHUNK, len(x)))
             theta = turned[chunk]
             pose = self.body.pose(theta, self.betas)
             coefficients = self.body.pose_coefficients(theta)
             samples = [limb.samples.posed(pose, coefficients).numpy() for limb in self.limbs]
-            surfaces = [limb.surface.points.posed(pose, coefficients).numpy() for limb in self.limbs]
             levers = [
                 _levers(
                     limb, pose, theta, x[chunk, k * self.freedoms : k * self.freedoms + 3], bend[k], chunk, self.body
@@ -324,138 +338,153 @@ class Stage:
             ]
             turns = pose.transforms.rotation.numpy()
             if self.core is not None:
-                still = self.core.surface.points.posed(pose, coefficients).numpy()
-                found += self._core_rows(chunk, samples, still, levers, turns)
-            found += self._pair_rows(chunk, samples, surfaces, levers, turns, ways)
-        return Rows(
-            *(
-                np.concatenate([getattr(rows, name) for rows in found])
-                for name in ("frame", "gradient", "distance", "owed", "whole", "exit")
-            )
-        )
+                if fresh or start not in self.still:
+                    self.still[start] = self.core.surface.points.posed(pose, coefficients).numpy()
+                found.append(self._core_rows(chunk, samples, self.core, self.still[start], levers, turns))
+            surfaces = [limb.surface.points.posed(pose, coefficients).numpy() for limb in self.limbs]
+            for k in range(2):
+                found.append(self._pair_rows(k, chunk, samples[k], surfaces[1 - k], levers, turns, ways))
+        return Rows(*(np.concatenate([getattr(rows, field.name) for rows in found]) for field in fields(Rows)))
 
     def _core_rows(
         self,
         frames: Int[np.ndarray, "S"],
         samples: Sequence[np.ndarray],
+        core: Core,
         still: Float[np.ndarray, "S V 3"],
         levers: Sequence["Levers"],
         turns: Float[np.ndarray, "S J 3 3"],
-    ) -> list[Rows]:
-        core = self.core
-        assert core is not None
-        mesh = ClosestPoint(still[0], core.part.faces)
-        counts = [samples[0].shape[1], samples[1].shape[1]]
+    ) -> Rows:
+        """Samples of both limbs against what does not give way."""
+        first = samples[0].shape[1]
         owed_trunk = np.concatenate([limb.owed_to_trunk for limb in self.limbs])
         owed_head = np.concatenate([limb.owed_to_head for limb in self.limbs])
-        found = []
-        for s, frame in enumerate(frames):
-            mesh.refit(still[s])
-            points = np.concatenate([samples[0][s], samples[1][s]])
-            hit = _signed(mesh, core.part, core.surface, points, turns[s])
-            head = core.head_faces[hit.face]
-            owed = np.where(head, owed_head, owed_trunk)
-            gradient = np.zeros((len(points), 2 * self.freedoms))
-            for k, part in enumerate((slice(0, counts[0]), slice(counts[0], None))):
-                own = slice(k * self.freedoms, (k + 1) * self.freedoms)
-                gradient[part, own] = levers[k].gradient(
-                    s, points[part], hit.normal[part], self.limbs[k].by_root, self.limbs[k].by_hinge
-                )
-            whole = ~head & (owed_trunk >= self.config.clearance)
-            none = np.zeros((len(points), 3))
-            found.append(Rows(np.full(len(points), frame), gradient, hit.distance, owed, whole, none))
-        return found
+        owes = np.broadcast_to(owed_trunk > 0, (len(frames), len(owed_trunk)))
+        hit = _signed(core.part, core.surface, still, np.concatenate(samples, axis=1), owes, turns)
+        head = core.head_faces[hit.face]
+        gradient = np.zeros((len(hit.face), 2 * self.freedoms))
+        for k, limb in enumerate(self.limbs):
+            mine = np.flatnonzero((hit.sample >= first) == (k == 1))
+            which = hit.sample[mine] - k * first
+            gradient[mine, k * self.freedoms : (k + 1) * self.freedoms] = levers[k].gradient(
+                hit.frame[mine], hit.query[mine], hit.normal[mine], limb.by_root[which], limb.by_hinge[which]
+            )
+        return Rows(
+            frame=frames[hit.frame],
+            gradient=gradient,
+            distance=hit.distance,
+            owed=np.where(head, owed_head[hit.sample], owed_trunk[hit.sample]),
+            whole=~head & (owed_trunk[hit.sample] >= self.config.clearance),
+            exit=np.zeros((len(hit.face), 3)),
+        )
 
     def _pair_rows(
         self,
+        k: int,
         frames: Int[np.ndarray, "S"],
-        samples: Sequence[np.ndarray],
-        surfaces: Sequence[np.ndarray],
+        samples: Float[np.ndarray, "S N 3"],
+        surface: Float[np.ndarray, "S V 3"],
         levers: Sequence["Levers"],
         turns: Float[np.ndarray, "S J 3 3"],
         ways: Float[np.ndarray, "T 3"],
-    ) -> list[Rows]:
-        """Samples of each limb against the other limb's mesh, which gives way too."""
-        trunk = self.body.parents[self.limbs[0].root]
-        found = []
-        meshes: dict[int, ClosestPoint] = {}
-        for k in range(2):
-            limb, other = self.limbs[k], self.limbs[1 - k]
-            for s, frame in enumerate(frames):
-                points, surface = samples[k][s], surfaces[1 - k][s]
-                reach = self.config.contact + 0.05
-                near = ((points > surface.min(0) - reach) & (points < surface.max(0) + reach)).all(1)
-                near &= limb.owed_to_other > 0
-                if not near.any():
-                    continue
-                if k in meshes:
-                    meshes[k].refit(surface)
-                else:
-                    meshes[k] = ClosestPoint(surface, other.part.faces)
-                points = points[near]
-                hit = _signed(meshes[k], other.part, other.surface, points, turns[s])
-                owed = limb.owed_to_other[near]
-                side = 1.0 if k == 0 else -1.0
-                leave = side * hit.normal @ turns[s, trunk]
-                # where limbs have gone through each other, nearest exits contradict: one way out a meeting
-                away = side * turns[s, trunk] @ ways[frame]
-                against = (hit.distance < owed) & (hit.normal @ away < 0.3) & bool(ways[frame].any())
-                hit.normal[against] = away
-                gradient = np.zeros((len(points), 2 * self.freedoms))
-                own = slice(k * self.freedoms, (k + 1) * self.freedoms)
-                theirs = slice((1 - k) * self.freedoms, (2 - k) * self.freedoms)
-                gradient[:, own] = levers[k].gradient(s, points, hit.normal, limb.by_root[near], limb.by_hinge[near])
-                by_root = (other.surface_by_root[hit.vertices] * hit.share).sum(1)
-                by_hinge = (other.surface_by_hinge[hit.vertices] * hit.share).sum(1)
-                gradient[:, theirs] = -levers[1 - k].gradient(s, hit.point, hit.normal, by_root, by_hinge)
-                none = np.zeros(len(points), bool)
-                found.append(
-                    Rows(np.full(len(points), frame), gradient, hit.distance, limb.owed_to_other[near], none, leave)
-                )
-        if not found:
-            D = 2 * self.freedoms
-            empty = np.zeros(0)
-            found.append(Rows(np.zeros(0, int), np.zeros((0, D)), empty, empty, np.zeros(0, bool), np.zeros((0, 3))))
-        return found
+    ) -> Rows:
+        """Samples of limb k against the other limb's mesh, which gives way too."""
+        limb, other = self.limbs[k], self.limbs[1 - k]
+        reach = self.config.contact + 0.05
+        low, high = surface.min(1, keepdims=True) - reach, surface.max(1, keepdims=True) + reach
+        near = ((samples > low) & (samples < high)).all(2) & (limb.owed_to_other > 0)
+        hit = _signed(other.part, other.surface, surface, samples, near, turns)
+        owed = limb.owed_to_other[hit.sample]
+        side = 1.0 if k == 0 else -1.0
+        trunk = turns[hit.frame, self.body.parents[self.limbs[0].root]]
+        leave = side * np.einsum("nij,ni->nj", trunk, hit.normal)
+        # where limbs have gone through each other, nearest exits contradict: one way out a meeting
+        away = side * np.einsum("nij,nj->ni", trunk, ways[frames[hit.frame]])
+        against = (hit.distance < owed) & ((hit.normal * away).sum(1) < 0.3) & (np.abs(away).sum(1) > 0)
+        normal = np.where(against[:, None], away, hit.normal)
+        gradient = np.zeros((len(hit.face), 2 * self.freedoms))
+        own = slice(k * self.freedoms, (k + 1) * self.freedoms)
+        theirs = slice((1 - k) * self.freedoms, (2 - k) * self.freedoms)
+        gradient[:, own] = levers[k].gradient(
+            hit.frame, hit.query, normal, limb.by_root[hit.sample], limb.by_hinge[hit.sample]
+        )
+        by_root = (other.surface_by_root[hit.vertices] * hit.share).sum(1)
+        by_hinge = (other.surface_by_hinge[hit.vertices] * hit.share).sum(1)
+        gradient[:, theirs] = -levers[1 - k].gradient(hit.frame, hit.point, normal, by_root, by_hinge)
+        return Rows(frames[hit.frame], gradient, hit.distance, owed, np.zeros(len(owed), bool), leave)
 
 
 @dataclass(frozen=True)
 class Hit:
-    """Closest points with a sign: positive outside."""
+    """Closest points nearer than REACH, with a sign: positive outside.  One row a sample and frame."""
 
+    frame: Int[np.ndarray, "N"]  # within the chunk
+    sample: Int[np.ndarray, "N"]
+    query: Float[np.ndarray, "N 3"]  # the sample
     face: Int[np.ndarray, "N"]
-    point: Float[np.ndarray, "N 3"]
+    point: Float[np.ndarray, "N 3"]  # its closest point
     distance: Float[np.ndarray, "N"]
     normal: Float[np.ndarray, "N 3"]  # the direction in which the distance grows
-    vertices: Int[np.ndarray, "N 3"]  # of the part
+    vertices: Int[np.ndarray, "N 3"]  # of the face
     share: Float[np.ndarray, "N 3"]  # barycentric
 
 
 def _signed(
-    mesh: ClosestPoint,
     part: Part,
     surface: Surface,
-    points: Float[np.ndarray, "N 3"],
-    turns: Float[np.ndarray, "J 3 3"],
+    posed: Float[np.ndarray, "S V 3"],
+    samples: Float[np.ndarray, "S N 3"],
+    asked: Bool[np.ndarray, "S N"],
+    turns: Float[np.ndarray, "S J 3 3"],
 ) -> Hit:
-    """Signed distances.  Vertex normals, turned with the skin, say the side (cheap); where they say "deep inside",
-    which folds and sharp rims make them say wrongly, the exact winding number decides.
+    """Signed distances of the samples that are asked for, all frames of a chunk.
+
+    Three judges of the side, each called where the one before says "inside": the face's normal; the vertex normals,
+    turned with the skin (folds and sharp rims mislead a face); deeper than DOUBTFUL_DEPTH, the exact winding number.
     """
-    near = mesh.query(points)
-    corners = part.faces[near.face]
-    normals = surface.normals[corners]
-    weights = surface.points.weights.numpy()[corners]
-    turned = np.einsum("nkj,jab,nkb->nka", weights, turns, normals, optimize=True)
-    normal = (near.barycentric[..., None] * turned).sum(1)
+    mesh = None
+    columns: list[tuple[np.ndarray, ...]] = []
+    for s in np.flatnonzero(asked.any(1)):
+        if mesh is None:
+            mesh = ClosestPoint(posed[s], part.faces)
+        else:
+            mesh.refit(posed[s])
+        which = np.flatnonzero(asked[s])
+        hit = mesh.query(samples[s, which])
+        kept = np.flatnonzero(hit.distance < REACH)
+        columns.append(
+            (
+                np.full(len(kept), s),
+                which[kept],
+                samples[s, which[kept]],
+                hit.face[kept],
+                hit.point[kept],
+                hit.distance[kept].astype(np.float64),
+                hit.barycentric[kept],
+            )
+        )
+    if not columns:
+        none, vector = np.zeros(0, int), np.zeros((0, 3))
+        return Hit(none, none, vector, none, vector, np.zeros(0), vector, np.zeros((0, 3), int), vector)
+    frame, sample, query, face, point, distance, share = (np.concatenate(column) for column in zip(*columns))
+    corners = part.faces[face]
+    away = query - point
+    a, b, c = (posed[frame, corners[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
-    away = points - near.point
-    sign = np.where((away * normal).sum(1) < 0, -1.0, 1.0)
-    deep = np.flatnonzero((sign < 0) & (near.distance > DOUBTFUL_DEPTH))
-    if len(deep):
-        sign[deep] = np.where(winding_number(points[deep], mesh.vertices, part.faces) > 0.5, -1.0, 1.0)
-    sure = near.distance > 1e-5
-    direction = np.where(sure[:, None], sign[:, None] * away / np.maximum(near.distance, 1e-5)[:, None], normal)
-    return Hit(near.face, near.point, sign * near.distance, direction, corners, near.barycentric)
+    sign = np.ones(len(frame))
+    claimed = np.flatnonzero((away * normal).sum(1) < 0)
+    blended = surface.points.weights.numpy()[corners[claimed]] @ turns[frame[claimed]].reshape(len(claimed), turns.shape[1], 9)
+    skin = (blended.reshape(-1, 3, 3, 3) @ surface.normals[corners[claimed]][..., None])[..., 0]
+    inner = claimed[(away[claimed] * (share[claimed, :, None] * skin).sum(1)).sum(1) < 0]
+    sign[inner] = -1.0
+    deep = inner[distance[inner] > DOUBTFUL_DEPTH]
+    for s in np.unique(frame[deep]):
+        here = deep[frame[deep] == s]
+        sign[here] = np.where(winding_number(query[here], posed[s], part.faces) > 0.5, -1.0, 1.0)
+    sure = distance > 1e-5
+    direction = np.where(sure[:, None], (sign / np.maximum(distance, 1e-5))[:, None] * away, normal)
+    return Hit(frame, sample, query, face, point, sign * distance, direction, corners, share)
 
 
 @dataclass(frozen=True)
@@ -500,18 +529,18 @@ class Levers:
 
     def gradient(
         self,
-        s: int,
+        s: Int[np.ndarray, "N"],
         points: Float[np.ndarray, "N 3"],
         normals: Float[np.ndarray, "N 3"],
         by_root: Float[np.ndarray, "N"],
         by_hinge: Float[np.ndarray, "N"],
     ) -> Float[np.ndarray, "N D"]:
-        """d(normal . point)/dx of points carried by the limb."""
+        """d(normal . point)/dx of points carried by the limb, each at its frame s of the chunk."""
         moment = np.cross(points - self.root[s], normals)
-        columns = by_root[:, None] * (moment @ self.axes[s])
+        columns = by_root[:, None] * np.einsum("ni,nij->nj", moment, self.axes[s])
         if self.hinge is None or self.hinge_axis is None:
             return columns
-        bend = by_hinge * (np.cross(points - self.hinge[s], normals) @ self.hinge_axis[s])
+        bend = by_hinge * (np.cross(points - self.hinge[s], normals) * self.hinge_axis[s]).sum(1)
         return np.concatenate([columns, bend[:, None]], 1)
 
 
@@ -566,7 +595,7 @@ def _ways_out(rows: Rows, frames: int, config: ClearingConfig) -> Float[np.ndarr
 
 
 def _state(rows: Rows, frames: int) -> State:
-    shortfall, distance = np.zeros(frames), np.full(frames, np.inf)
+    shortfall, distance = np.zeros(frames), np.full(frames, REACH)
     np.maximum.at(shortfall, rows.frame, np.where(rows.owed > 0, rows.owed - rows.distance, 0.0))
     np.minimum.at(distance, rows.frame[rows.whole], rows.distance[rows.whole])
     return State(shortfall, distance)
