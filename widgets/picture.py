@@ -93,7 +93,7 @@ def _draw_view(plotter: Any, view: View, shared: Camera) -> None:
         _add_on_top(plotter, top)
     if view.title:
         plotter.add_text(
-            view.title, position=(0.03, 0.94), viewport=True, font_size=TITLE_SIZE * OVERSAMPLING // 2, color="#303030"
+            view.title, position=(0.03, 0.955), viewport=True, font_size=TITLE_SIZE * OVERSAMPLING // 2, color="#303030"
         )
     plotter.renderer.ResetCameraClippingRange()
 

@@ -15,6 +15,7 @@ Colour = tuple[float, float, float]  # red, green, blue in [0, 1], as a screen s
 SKIN: Colour = (0.86, 0.72, 0.62)
 CLOTH: Colour = (0.36, 0.52, 0.72)
 WARNING: Colour = (0.95, 0.0, 0.45)  # colliding vertices: a colour that no colour map and no cloth has
+ROOM, ROOM_FOR_TITLES = 1.06, 1.16  # size of a view against what is in it
 PAPER: Colour = (0.97, 0.97, 0.96)
 
 
@@ -105,7 +106,11 @@ class Scene:
 
     def resolved_camera(self, aspect: float = 1.0) -> Camera:
         """The shared camera; `aspect` is a view's width over its height."""
-        return self.camera or camera_of([layer for view in self.views for layer in view.layers], aspect=aspect)
+        if self.camera is not None:
+            return self.camera
+        titled = any(view.title for view in self.views)
+        layers = [layer for view in self.views for layer in view.layers]
+        return camera_of(layers, margin=ROOM_FOR_TITLES if titled else ROOM, aspect=aspect)
 
 
 def positions_of(layer: Layer) -> Float[ndarray, "N 3"]:
@@ -121,7 +126,7 @@ def camera_of(
     layers: Iterable[Layer],
     direction: tuple[float, float, float] = (0.25, -1.0, 0.12),
     view_angle: float = 24.0,
-    margin: float = 1.06,
+    margin: float = ROOM,
     aspect: float = 1.0,
 ) -> Camera:
     """A camera that sees all layers from `direction` (the front, slightly left and above: the body faces -y).
