@@ -26,9 +26,9 @@ from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.body.skinning import Pose, linear_blend
+from workbench.body.skinning import Pose, RigidTransforms, linear_blend
 from workbench.geometry.closest_point import ClosestPoint
-from workbench.geometry.mesh import boundary_loops, vertex_normals
+from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.geometry.winding import winding_number
 from workbench.motion import Motion
@@ -54,6 +54,7 @@ NAMES = (
 )
 LIMBS = ("left arm", "right arm", "left leg", "right leg")
 REACH = 0.15  # metres: what is farther off is not looked at
+PAIR_REACH = 0.05  # the same between two limbs, beyond the contact distance
 DOUBTFUL_DEPTH = 0.01  # metres inside from which vertex normals are not believed: ours, measured
 CHUNK = 32  # frames posed at once: bounds the memory
 
@@ -72,11 +73,13 @@ class ClearingConfig:
     margin: float = 0.0015  # metres aimed at beyond what is owed, against the gaps between samples
     tolerance: float = 0.001  # metres short of what is owed that still count as clear
     stiffness: float = 1e5  # mu, rad^2 / m^2: 1 mm of one sample weighs like 0.3 rad in one frame
-    samples: int = 220  # a limb; spread evenly over its surface
+    all_samples: int = 400  # a limb, spread evenly over its vertices: what clear means
+    samples: int = 100  # of these to start with; those that stay short are taken in: ours, an exchange method
+    exchanges: int = 3
     rounds: int = 14  # linearisations at most
     step: float = 0.2  # radians a round at most
     damping: float = 1.0  # rad^-2: weight of a round's change beside |x|^2, against overshooting
-    settled: float = 0.02  # radians: clear and changing by less than this ends the rounds
+    settled: float = 0.03  # radians: clear and changing by less than this ends the rounds
     most_arm: float = 75.0  # degrees about one axis; what would need more stays and is reported: ours
     most_leg: float = 30.0
     meeting_gap: int = 6  # frames apart up to which two contacts of the same limbs are one meeting
@@ -103,7 +106,7 @@ class Part:
 
     vertices: Int[np.ndarray, "V"]  # of the body
     faces: Int[np.ndarray, "F 3"]  # into `vertices`, then one cap centre a rim
-    rims: tuple[Int[np.ndarray, " R"], ...]  # into `vertices`
+    rims: tuple[Int[np.ndarray, "_"], ...]  # into `vertices`
 
     def with_centres(self, values: Float[np.ndarray, "N *C"]) -> Float[np.ndarray, "W *C"]:
         """Values a body vertex -> values a vertex of the part; a cap's centre takes the mean of its rim."""
@@ -115,12 +118,29 @@ def closed_part(faces: Int[Tensor, "F 3"], chosen: Bool[Tensor, "V"]) -> Part:
     """Faces with at least two chosen corners, closed."""
     kept = faces[chosen[faces].sum(1) >= 2]
     vertices, local = torch.unique(kept, return_inverse=True)
-    rims = tuple(rim.numpy() for rim in boundary_loops(local))
+    rims = _rims(local.numpy())
     fans = [local.numpy()]
     for cap, rim in enumerate(rims):
         centre = np.full(len(rim), len(vertices) + cap)
         fans.append(np.stack([np.roll(rim, -1), rim, centre], 1))
     return Part(vertices.numpy(), np.concatenate(fans), rims)
+
+
+def _rims(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "_"], ...]:
+    """Boundary loops in the direction of the faces: geometry.mesh.boundary_loops, much faster on a whole body."""
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    count = int(faces.max()) + 1
+    border = half[~np.isin(half[:, 0] * count + half[:, 1], half[:, 1] * count + half[:, 0])]
+    following = {int(a): int(b) for a, b in border}
+    if len(following) < len(border):
+        raise ValueError("a part of the body has two boundary loops that touch; this body cannot be cleared")
+    rims = []
+    while following:
+        rim = [next(iter(following))]
+        while (after := following.pop(rim[-1])) != rim[0]:
+            rim.append(after)
+        rims.append(np.array(rim))
+    return tuple(rims)
 
 
 @dataclass(frozen=True)
@@ -163,6 +183,19 @@ class Limb:
     surface_by_root: Float[np.ndarray, "V"]
     surface_by_hinge: Float[np.ndarray, "V"]
 
+    def with_samples(self, index: Int[np.ndarray, " S"]) -> "Limb":
+        """The same limb, watched at some of its samples."""
+        points = self.samples
+        return replace(
+            self,
+            samples=Points(points.rest[index], points.pose_directions[:, index], points.weights[index]),
+            by_root=self.by_root[index],
+            by_hinge=self.by_hinge[index],
+            owed_to_trunk=self.owed_to_trunk[index],
+            owed_to_head=self.owed_to_head[index],
+            owed_to_other=self.owed_to_other[index],
+        )
+
 
 @dataclass(frozen=True)
 class Core:
@@ -177,12 +210,20 @@ class Core:
 class Rows:
     """Linearised distances: d_i(x) = distance + gradient . (x_frame - x0_frame)."""
 
+    limb: Int[np.ndarray, "N"]  # 0 left, 1 right
+    sample: Int[np.ndarray, "N"]  # of the limb
     frame: Int[np.ndarray, "N"]
     gradient: Float[np.ndarray, "N D"]
     distance: Float[np.ndarray, "N"]
     owed: Float[np.ndarray, "N"]
     whole: Bool[np.ndarray, "N"]  # the sample owes the whole clearance to torso or legs
     exit: Float[np.ndarray, "N 3"]  # between the two limbs: the way the left one leaves, in the trunk's frame; else 0
+
+    @staticmethod
+    def none(freedoms: int) -> "Rows":
+        empty, index = np.zeros(0), np.zeros(0, int)
+        nothing = np.zeros(0, bool)
+        return Rows(index, index, index, np.zeros((0, freedoms)), empty, empty, nothing, np.zeros((0, 3)))
 
 
 def clear(
@@ -252,38 +293,76 @@ class Stage:
         self.body, self.betas, self.limbs, self.core, self.config = body, betas, limbs, core, config
         self.smoothness = (config.smoothing * fps) ** 4
         self.still: dict[int, np.ndarray] = {}  # the core as last posed, by first frame of the chunk
+        self.meshes: dict[int, ClosestPoint] = {}  # one a part, moved from frame to frame
+        self.use(tuple(np.arange(len(limb.by_root)) for limb in limbs))
         self.freedoms = 3 if limbs[0].hinge is None else 4
         self.most = np.deg2rad(config.most_leg if core is None else config.most_arm)
 
     def solve(self, rotations: Float[Tensor, "T J 3 3"]) -> tuple[Tensor, np.ndarray, State, State]:
-        """(rotations, degrees added (T,2), state before, state after)."""
-        T, D, config = len(rotations), 2 * self.freedoms, self.config
+        """(rotations, degrees added (T,2), state before, state after).
+
+        Exchange method: descend with few samples, look at all of them, take in those that are short, and again.
+        """
+        T, config = len(rotations), self.config
         bend = [_bend(rotations, self.body, limb) for limb in self.limbs]
-        x = np.zeros((T, D))
+        x = best = np.zeros((T, 2 * self.freedoms))
+        everything = tuple(np.arange(len(limb.by_root)) for limb in self.limbs)
+        chosen = tuple(index[: config.samples] for index in everything)
+        self.use(everything)
         rows = self.rows(rotations, x, bend, np.zeros((T, 3)))
         before = after = _state(rows, T)
-        if (before.shortfall > config.tolerance).any():
-            best, best_state, least = x, before, np.inf
-            ways = _ways_out(rows, T, config)
-            for turn in range(config.rounds):
-                last, x = x, np.clip(_least_rotation(rows, x, self.smoothness, config), -self.most, self.most)
-                fresh = turn % 4 == 3 or turn == config.rounds - 1
-                rows = self.rows(rotations, x, bend, ways, fresh=fresh)
-                state = _state(rows, T)
-                done = state.shortfall.max() <= 0.5 * config.tolerance and np.abs(x - last).max() < config.settled
-                if done and not fresh:
-                    fresh, rows = True, self.rows(rotations, x, bend, ways)
-                    state = _state(rows, T)
-                    done = state.shortfall.max() <= 0.5 * config.tolerance
-                cost = _cost(rows, x, self.smoothness, config)
-                if fresh and cost < least:
-                    best, best_state, least = x, state, cost
-                if done:
-                    break
-            x, after = best, best_state
+        ways, least = _ways_out(rows, T, config), np.inf
+        for exchange in range(config.exchanges):
+            if after.shortfall.max() <= config.tolerance:
+                break
+            chosen = tuple(
+                np.union1d(index, self.worst(rows, k)[: config.samples // 4]) for k, index in enumerate(chosen)
+            )
+            self.use(chosen)
+            x = self.descend(rotations, x, bend, ways, config.rounds if exchange == 0 else config.rounds // 2)
+            self.use(everything)
+            rows = self.rows(rotations, x, bend, ways)
+            cost = _cost(rows, x, self.smoothness, config)
+            if cost < least:
+                best, least, after = x, cost, _state(rows, T)
         self.still.clear()
-        turned = self.turned(rotations, x, bend) if np.any(x) else rotations
-        return turned, self.degrees(x, bend), before, after
+        turned = self.turned(rotations, best, bend) if np.any(best) else rotations
+        return turned, self.degrees(best, bend), before, after
+
+    def descend(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        x: Float[np.ndarray, "T D"],
+        bend: Sequence["Bend | None"],
+        ways: Float[np.ndarray, "T 3"],
+        rounds: int,
+    ) -> Float[np.ndarray, "T D"]:
+        """Rounds of linearising and solving; the best x met."""
+        config, T = self.config, len(x)
+        best, least = x, np.inf
+        rows = self.rows(rotations, x, bend, ways)
+        for turn in range(rounds):
+            last, x = x, np.clip(_least_rotation(rows, x, self.smoothness, config), -self.most, self.most)
+            rows = self.rows(rotations, x, bend, ways, fresh=turn % 4 == 3)
+            cost = _cost(rows, x, self.smoothness, config)
+            if cost < least:
+                best, least = x, cost
+            if _state(rows, T).shortfall.max() <= 0 and np.abs(x - last).max() < config.settled:
+                break
+        return best
+
+    def use(self, chosen: Sequence[Int[np.ndarray, "_"]]) -> None:
+        """Look at these samples of each limb from now on."""
+        self.chosen = tuple(chosen)
+        self.working = tuple(limb.with_samples(index) for limb, index in zip(self.limbs, chosen))
+
+    def worst(self, rows: Rows, k: int) -> Int[np.ndarray, " N"]:
+        """Samples of limb k that are short of what they aim at, the worst first."""
+        mine = (rows.limb == k) & (rows.owed > 0)
+        short = np.zeros(len(self.limbs[k].by_root))
+        np.maximum.at(short, rows.sample[mine], (rows.owed - rows.distance)[mine])
+        order = np.argsort(-short)
+        return order[short[order] > 0]
 
     def turned(
         self, rotations: Float[Tensor, "T J 3 3"], x: Float[np.ndarray, "T D"], bend: Sequence["Bend | None"]
@@ -329,21 +408,28 @@ class Stage:
             theta = turned[chunk]
             pose = self.body.pose(theta, self.betas)
             coefficients = self.body.pose_coefficients(theta)
-            samples = [limb.samples.posed(pose, coefficients).numpy() for limb in self.limbs]
+            samples = [limb.samples.posed(pose, coefficients).numpy() for limb in self.working]
             levers = [
                 _levers(
                     limb, pose, theta, x[chunk, k * self.freedoms : k * self.freedoms + 3], bend[k], chunk, self.body
                 )
-                for k, limb in enumerate(self.limbs)
+                for k, limb in enumerate(self.working)
             ]
             turns = pose.transforms.rotation.numpy()
             if self.core is not None:
                 if fresh or start not in self.still:
                     self.still[start] = self.core.surface.points.posed(pose, coefficients).numpy()
                 found.append(self._core_rows(chunk, samples, self.core, self.still[start], levers, turns))
-            surfaces = [limb.surface.points.posed(pose, coefficients).numpy() for limb in self.limbs]
-            for k in range(2):
-                found.append(self._pair_rows(k, chunk, samples[k], surfaces[1 - k], levers, turns, ways))
+            close = np.flatnonzero(_boxes_meet(samples[0], samples[1], self.config.contact + 2 * PAIR_REACH))
+            if len(close):
+                near = Pose(
+                    RigidTransforms(pose.transforms.rotation[close], pose.transforms.translation[close]),
+                    pose.joints[close],
+                )
+                for k in range(2):
+                    surface = self.limbs[1 - k].surface.points.posed(near, coefficients[close]).numpy()
+                    found.append(self._pair_rows(k, chunk, close, samples[k][close], surface, levers, turns, ways))
+        found.append(Rows.none(2 * self.freedoms))
         return Rows(*(np.concatenate([getattr(rows, field.name) for rows in found]) for field in fields(Rows)))
 
     def _core_rows(
@@ -357,19 +443,22 @@ class Stage:
     ) -> Rows:
         """Samples of both limbs against what does not give way."""
         first = samples[0].shape[1]
-        owed_trunk = np.concatenate([limb.owed_to_trunk for limb in self.limbs])
-        owed_head = np.concatenate([limb.owed_to_head for limb in self.limbs])
+        owed_trunk = np.concatenate([limb.owed_to_trunk for limb in self.working])
+        owed_head = np.concatenate([limb.owed_to_head for limb in self.working])
         owes = np.broadcast_to(owed_trunk > 0, (len(frames), len(owed_trunk)))
-        hit = _signed(core.part, core.surface, still, np.concatenate(samples, axis=1), owes, turns)
+        hit = _signed(core.part, core.surface, still, np.concatenate(samples, axis=1), owes, turns, self.meshes)
         head = core.head_faces[hit.face]
         gradient = np.zeros((len(hit.face), 2 * self.freedoms))
-        for k, limb in enumerate(self.limbs):
-            mine = np.flatnonzero((hit.sample >= first) == (k == 1))
+        for k, limb in enumerate(self.working):
+            mine = np.flatnonzero((hit.sample >= first) == bool(k))
             which = hit.sample[mine] - k * first
             gradient[mine, k * self.freedoms : (k + 1) * self.freedoms] = levers[k].gradient(
                 hit.frame[mine], hit.query[mine], hit.normal[mine], limb.by_root[which], limb.by_hinge[which]
             )
+        of_right = hit.sample >= first
         return Rows(
+            limb=of_right.astype(int),
+            sample=np.concatenate(self.chosen)[hit.sample],
             frame=frames[hit.frame],
             gradient=gradient,
             distance=hit.distance,
@@ -382,18 +471,20 @@ class Stage:
         self,
         k: int,
         frames: Int[np.ndarray, "S"],
-        samples: Float[np.ndarray, "S N 3"],
-        surface: Float[np.ndarray, "S V 3"],
+        close: Int[np.ndarray, "C"],
+        samples: Float[np.ndarray, "C N 3"],
+        surface: Float[np.ndarray, "C V 3"],
         levers: Sequence["Levers"],
         turns: Float[np.ndarray, "S J 3 3"],
         ways: Float[np.ndarray, "T 3"],
     ) -> Rows:
-        """Samples of limb k against the other limb's mesh, which gives way too."""
-        limb, other = self.limbs[k], self.limbs[1 - k]
-        reach = self.config.contact + 0.05
+        """Samples of limb k against the other limb's mesh, which gives way too, at the `close` frames of the chunk."""
+        limb, other = self.working[k], self.working[1 - k]
+        reach = self.config.contact + PAIR_REACH
         low, high = surface.min(1, keepdims=True) - reach, surface.max(1, keepdims=True) + reach
         near = ((samples > low) & (samples < high)).all(2) & (limb.owed_to_other > 0)
-        hit = _signed(other.part, other.surface, surface, samples, near, turns)
+        hit = _signed(other.part, other.surface, surface, samples, near, turns[close], self.meshes)
+        hit = replace(hit, frame=close[hit.frame])
         owed = limb.owed_to_other[hit.sample]
         side = 1.0 if k == 0 else -1.0
         trunk = turns[hit.frame, self.body.parents[self.limbs[0].root]]
@@ -411,7 +502,24 @@ class Stage:
         by_root = (other.surface_by_root[hit.vertices] * hit.share).sum(1)
         by_hinge = (other.surface_by_hinge[hit.vertices] * hit.share).sum(1)
         gradient[:, theirs] = -levers[1 - k].gradient(hit.frame, hit.point, normal, by_root, by_hinge)
-        return Rows(frames[hit.frame], gradient, hit.distance, owed, np.zeros(len(owed), bool), leave)
+        return Rows(
+            limb=np.full(len(owed), k),
+            sample=self.chosen[k][hit.sample],
+            frame=frames[hit.frame],
+            gradient=gradient,
+            distance=hit.distance,
+            owed=owed,
+            whole=np.zeros(len(owed), bool),
+            exit=leave,
+        )
+
+
+def _boxes_meet(
+    one: Float[np.ndarray, "S N 3"], other: Float[np.ndarray, "S M 3"], reach: float
+) -> Bool[np.ndarray, "S"]:
+    """Frames at which the bounding boxes of two clouds are nearer than `reach` along every axis."""
+    gap = np.maximum(one.min(1) - other.max(1), other.min(1) - one.max(1))
+    return np.all(gap < reach, axis=1)
 
 
 @dataclass(frozen=True)
@@ -436,19 +544,19 @@ def _signed(
     samples: Float[np.ndarray, "S N 3"],
     asked: Bool[np.ndarray, "S N"],
     turns: Float[np.ndarray, "S J 3 3"],
+    meshes: dict[int, ClosestPoint],
 ) -> Hit:
     """Signed distances of the samples that are asked for, all frames of a chunk.
 
     Three judges of the side, each called where the one before says "inside": the face's normal; the vertex normals,
     turned with the skin (folds and sharp rims mislead a face); deeper than DOUBTFUL_DEPTH, the exact winding number.
     """
-    mesh = None
     columns: list[tuple[np.ndarray, ...]] = []
     for s in np.flatnonzero(asked.any(1)):
-        if mesh is None:
-            mesh = ClosestPoint(posed[s], part.faces)
-        else:
-            mesh.refit(posed[s])
+        if id(part) not in meshes:
+            meshes[id(part)] = ClosestPoint(posed[s], part.faces)
+        mesh = meshes[id(part)]
+        mesh.refit(posed[s])
         which = np.flatnonzero(asked[s])
         hit = mesh.query(samples[s, which])
         kept = np.flatnonzero(hit.distance < REACH)
@@ -474,7 +582,9 @@ def _signed(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     sign = np.ones(len(frame))
     claimed = np.flatnonzero((away * normal).sum(1) < 0)
-    blended = surface.points.weights.numpy()[corners[claimed]] @ turns[frame[claimed]].reshape(len(claimed), turns.shape[1], 9)
+    blended = surface.points.weights.numpy()[corners[claimed]] @ turns[frame[claimed]].reshape(
+        len(claimed), turns.shape[1], 9
+    )
     skin = (blended.reshape(-1, 3, 3, 3) @ surface.normals[corners[claimed]][..., None])[..., 0]
     inner = claimed[(away[claimed] * (share[claimed, :, None] * skin).sum(1)).sum(1) < 0]
     sign[inner] = -1.0
@@ -694,7 +804,7 @@ def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tup
             to_trunk = _owed(off, config.clearance, config.near, config.far)
             to_head = _owed(off, config.contact, config.near, config.far)
             to_other = _owed(apart.query(points).distance, config.contact, config.near, config.far)
-        chosen = _spread(points, np.maximum(to_trunk, to_other) > 0, config.samples)
+        chosen = _spread(points, np.maximum(to_trunk, to_other) > 0, config.all_samples)
         by_root = body.weights[:, carried[name]].sum(1).double().numpy()
         below = torch.tensor(skeleton.descendants(hinge)) if hinge is not None else torch.zeros(0, dtype=torch.long)
         by_hinge = body.weights[:, below].sum(1).double().numpy()
@@ -739,7 +849,7 @@ def _surface(body: Body, rest: Float[Tensor, "V 3"], part: Part) -> Surface:
 def _faces_of(part: Part, chosen: Bool[Tensor, "V"]) -> Bool[np.ndarray, "F"]:
     """Faces of a part whose real corners are all chosen (caps never are)."""
     flags = np.concatenate([chosen.numpy()[part.vertices], np.zeros(len(part.rims), bool)])
-    return flags[part.faces].all(1)
+    return np.all(flags[part.faces], axis=1)
 
 
 def _spread(points: Float[np.ndarray, "N 3"], allowed: Bool[np.ndarray, "N"], count: int) -> Int[np.ndarray, "S"]:
