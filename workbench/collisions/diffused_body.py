@@ -1,11 +1,11 @@
-"""4.1, Eq. 4-6: smooth body fields at any point.  p (N,3) -> W~ (N,J), B~s (N,K,3) a shape, B~p (N,P,3) a pose direction.
+"""4.1, Eq. 4-6: smooth body fields at any point.  p (N,3) -> W~ (N,J), B~s (N,K,3) and B~p (N,P,3) by direction.
 
-Three implementations of one interface: the Monte-Carlo definition (reference), the paper's networks, a table (the canonical
-body is constant, so its fields are functions of the point alone).
+Three implementations of one interface: the Monte-Carlo definition (reference), the paper's networks, a table (the
+canonical body is constant, so its fields are functions of the point alone).
 
-Deviations from the paper, which leaves both open: the spread of N(p, d) is read as standard deviation d, the distance from p
-to the surface; and the N normal directions are one scrambled Sobol set shared by all points, so that the fields are smooth
-in p and repeatable (independent draws would make them noise).
+Deviations from the paper, which leaves both open: the spread of N(p, d) is read as standard deviation d, the distance
+from p to the surface; and the N normal directions are one scrambled Sobol set shared by all points, so that the fields
+are smooth in p and repeatable (independent draws would make them noise).
 """
 
 import hashlib
@@ -40,6 +40,14 @@ QUERIES_AT_ONCE = 1 << 20  # closest-point queries a chunk: 60 MB of intermediat
 
 
 @dataclass(frozen=True)
+class Rigging:
+    """What Eq. 7-8 need of the fields at points once beta and theta are known: W~, and B~s + B~p in metres."""
+
+    weights: Float[Tensor, "*B N J"]
+    offset: Float[Tensor, "*B N 3"]
+
+
+@dataclass(frozen=True)
 class FieldValues:
     """W~, and the directions that B~s and B~p are linear in, at points: B~s = beta . shape_directions, B~p = (pose
     feature @ pose_map) . pose_directions."""
@@ -48,13 +56,11 @@ class FieldValues:
     shape_directions: Float[Tensor, "*B N K 3"]
     pose_directions: Float[Tensor, "*B N P 3"]
 
-
-@dataclass(frozen=True)
-class Rigging:
-    """What Eq. 7-8 need of the fields at points once beta and theta are known: W~, and B~s + B~p in metres."""
-
-    weights: Float[Tensor, "*B N J"]
-    offset: Float[Tensor, "*B N 3"]
+    def rigging(self, betas: Float[Tensor, "*B K"], pose_coefficients: Float[Tensor, "*B P"]) -> Rigging:
+        """With beta and the pose coefficients (pose feature @ pose_map) known."""
+        shape = torch.einsum("...k,...nki->...ni", betas, self.shape_directions)
+        pose = torch.einsum("...p,...npi->...ni", pose_coefficients, self.pose_directions)
+        return Rigging(self.weights, shape + pose)
 
 
 @dataclass(frozen=True)
@@ -132,10 +138,7 @@ class LinearFields(DiffusedFields, ABC):
         betas: Float[Tensor, "*B K"],
         pose_coefficients: Float[Tensor, "*B P"],
     ) -> Rigging:
-        values = self.at(points)
-        shape = torch.einsum("...k,...nki->...ni", betas, values.shape_directions)
-        pose = torch.einsum("...p,...npi->...ni", pose_coefficients, values.pose_directions)
-        return Rigging(values.weights, shape + pose)
+        return self.at(points).rigging(betas, pose_coefficients)
 
 
 # The Monte-Carlo definition
@@ -288,8 +291,8 @@ def body_fingerprint(body: Body) -> str:
 
 
 class LearnedFields(DiffusedFields):
-    """The paper's three networks: W~ p -> J with softmax, B~s concat(p, beta) -> 3, B~p concat(p, pose feature) -> 3; each of 5
-    hidden layers of 256 with ReLU (facts.md 1).
+    """The paper's three networks: W~ p -> J with softmax, B~s concat(p, beta) -> 3, B~p concat(p, pose feature) -> 3; each
+    of 5 hidden layers of 256 with ReLU (facts.md 1).
 
     Ours: p is centred and scaled to the unit box; the pose feature is projected onto what B_p can see of it
     (feature @ pose_map @ pinv(pose_map)), which changes no value of B_p and spares the network 246 idle directions; the
@@ -381,8 +384,8 @@ def _beside(points: Float[Tensor, "*B N 3"], condition: Float[Tensor, "*B c"]) -
 
 @dataclass(frozen=True)
 class GridFieldsConfig:
-    """How Eq. 4-6 are tabulated.  Tolerances are the largest error a cell may have at its middle points at the surface; they
-    grow linearly with the distance, doubling at `relax` metres.  Ours, measured (see the README's table)."""
+    """How Eq. 4-6 are tabulated.  Tolerances are the largest error a cell may have at its middle points at the surface;
+    they grow linearly with the distance, doubling at `relax` metres.  Ours, measured (`workbench evaluate fields`)."""
 
     samples: int = 512  # N of Eq. 4-6, quasi-random: error 0.001 in L1
     seed: int = 0
@@ -399,8 +402,8 @@ POSE_SPREAD = 0.25  # typical coefficient of a pose direction over random poses
 
 
 class GridFields(LinearFields):
-    """Eq. 4-6 read off a table: eight rows a point, the exact gradient of the interpolant, any points (the border's value
-    outside of the box)."""
+    """Eq. 4-6 read off a table: eight rows a point, the exact gradient of the interpolant; outside of the box, the value
+    at its border."""
 
     def __init__(self, grid: FieldGrid, body: Body):
         self.layout = FieldLayout.of(body)

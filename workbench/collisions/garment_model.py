@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.body.skinning import RigidTransforms, blended_affine, dual_quaternion
-from workbench.collisions.diffused_body import DiffusedFields
+from workbench.body.skinning import RigidTransforms, blended_affine
+from workbench.collisions.diffused_body import DiffusedFields, Rigging
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,12 @@ class LocalMap:
     rotation: Float[Tensor, "*B N 3 3"]  # A: the blended rotation
     translation: Float[Tensor, "*B N 3"]  # t
     offset: Float[Tensor, "*B N 3"]  # B~s(X, beta) + B~p(X, theta)
+
+    @staticmethod
+    def of(rigging: Rigging, state: BodyState) -> "LocalMap":
+        """The map of points whose rigging is known."""
+        rotation, translation = blended_affine(rigging.weights, state.transforms)
+        return LocalMap(rotation, translation, rigging.offset)
 
     def unposed(self, X: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B N 3"]:
         """T_G = X + B~s + B~p      (Eq. 8)"""
@@ -77,9 +83,7 @@ class GarmentModel:
 
     def local_map(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> LocalMap:
         """W~, B~s and B~p at X, contracted with beta and theta."""
-        rigging = self.fields.rigging(X, state.betas, state.pose_coefficients)
-        rotation, translation = blended_affine(rigging.weights, state.transforms)
-        return LocalMap(rotation, translation, rigging.offset)
+        return LocalMap.of(self.fields.rigging(X, state.betas, state.pose_coefficients), state)
 
     def unposed(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> Float[Tensor, "*B N 3"]:
         """T_G(X, beta, theta) = X + B~s(X, beta) + B~p(X, theta)      (Eq. 8)"""
@@ -92,11 +96,6 @@ class GarmentModel:
         """
         _check_points(X)
         return self.local_map(X, state).posed(X)
-
-    def posed_by_dual_quaternions(self, X: Float[Tensor, "*B N 3"], state: BodyState) -> Float[Tensor, "*B N 3"]:
-        """Eq. 7 with W a dual-quaternion blend; B~p, fitted to linear blending, is left out."""
-        rigging = self.fields.rigging(X, state.betas, torch.zeros_like(state.pose_coefficients))
-        return dual_quaternion(X + rigging.offset, rigging.weights, state.transforms)
 
 
 def _check_points(X: Tensor) -> None:

@@ -15,6 +15,8 @@ from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.garment_model import BodyState, GarmentModel
 from workbench.geometry.strain import RestTriangles, deformation_gradient, green_strain
 
+POINTS_AT_ONCE = 4096  # of the Newton steps: bounds the memory of their Jacobians
+
 Progress = Callable[[int], None]
 
 
@@ -22,15 +24,18 @@ Progress = Callable[[int], None]
 class ProjectionConfig:
     """The paper leaves all of these open; ours, measured by `workbench evaluate projection`."""
 
-    fixed_point_steps: int = 12  # facts: tenfold contraction a step; the last few are for the folds
+    fixed_point_steps: int = 6  # facts: tenfold contraction a step
+    newton_steps: int = 12  # from each start, for the few vertices that the fixed point circles around
+    carry_steps: int = 20  # averagings by which a bad vertex learns where its neighbours went
+    newton_reach: float = 0.02  # metres a step at most
     tolerance: float = 2e-5  # metres of re-posing error at which a vertex rests
     mended_error: float = 1e-4  # metres; vertices above it go to the optimisation
     strain_weight: float = 1e-6  # omega_1 of Eq. 9: strain 0.5 weighs as much as 0.5 mm
     collision_weight: float = 4e-3  # omega_2 of Eq. 9: worth up to 2 mm of re-posing error
     clearance: float = 1e-3  # epsilon of Eq. 12, metres
-    mend_rings: int = 2  # vertices around the bad ones that may move along
-    mend_steps: int = 60
-    mend_rate: float = 5e-4  # metres a step at the start
+    mend_rings: int = 1  # vertices around the bad ones that may move along
+    mend_steps: int = 30
+    mend_rate: float = 2e-4  # metres a step at the start
     frames_at_once: int = 32
 
 
@@ -105,7 +110,49 @@ class Projector:
             canonical[frame], errors[frame] = fixed_point(self.model, target, state[frame], start, self.config)
             start = canonical[frame]
             progress(1)
+        for guess in (
+            lambda bad: canonical,
+            lambda bad: self._carried(canonical, bad),
+            lambda bad: self._template(bad),
+        ):
+            self._retry(garment, state, canonical, errors, guess)
         return Projection(canonical, errors, torch.zeros_like(errors, dtype=torch.bool))
+
+    def _retry(
+        self,
+        garment: Float[Tensor, "T N 3"],
+        state: BodyState,
+        canonical: Float[Tensor, "T N 3"],
+        errors: Float[Tensor, "T N"],
+        guess: Callable[[Bool[Tensor, "T N"]], Float[Tensor, "T N 3"]],
+    ) -> None:
+        """Newton steps from another start for the vertices that are still wrong; the better answer stays (in place)."""
+        bad = errors > self.config.mended_error
+        if not bool(bad.any()):
+            return
+        start = guess(bad)
+        frame, vertex = bad.nonzero(as_tuple=True)
+        for part in _chunks(len(frame), POINTS_AT_ONCE):
+            pair = (frame[part], vertex[part])
+            X, error = levenberg_marquardt(self.model, garment[pair], state[frame[part]], start[pair], self.config)
+            better = error < errors[pair]
+            canonical[pair] = torch.where(better[:, None], X, canonical[pair])
+            errors[pair] = torch.minimum(error, errors[pair])
+
+    def _carried(self, canonical: Float[Tensor, "T N 3"], bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
+        """Where the mesh around them would carry bad vertices: their neighbours' displacement from the template."""
+        displacement = torch.where(bad[..., None], 0.0, canonical - self.template)
+        known = (~bad).to(canonical.dtype)
+        for _ in range(self.config.carry_steps):
+            total = _neighbour_sum(displacement, self.rest.faces)
+            weight = _neighbour_sum(known[..., None], self.rest.faces)
+            mean = total / weight.clamp_min(1e-9)
+            displacement = torch.where(bad[..., None], mean, displacement)
+            known = torch.where(bad, (weight[..., 0] > 0).to(known.dtype), known)
+        return self.template + displacement
+
+    def _template(self, bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
+        return self.template.expand(len(bad), -1, -1)
 
     def mend(self, garment: Float[Tensor, "T N 3"], state: BodyState, start: Projection) -> Projection:
         """Minimise Eq. 9 over the vertices that unskinning left wrong or inside the body, and their neighbours.
@@ -251,6 +298,61 @@ def fixed_point(
         trial = (trial + local.pulled_back(residual))[going]
         active = active[going]
     return X, best
+
+
+def levenberg_marquardt(
+    model: GarmentModel,
+    target: Float[Tensor, "P 3"],
+    state: BodyState,
+    start: Float[Tensor, "P 3"],
+    config: ProjectionConfig,
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
+    """Minimise |M_G - M_G(X)|^2 point by point with the exact Jacobian, each point in its own frame of `state`.
+
+    Where weights change fast (armpits) the fixed point circles around the solution; this finds it, or the nearest miss.
+    """
+    X, damping = start.clone(), torch.full(start.shape[:-1], 1e-3, dtype=start.dtype)
+    posed, jacobian = _posed_with_jacobian(model, X, state)
+    residual, best = target - posed, (target - posed).norm(dim=-1)
+    active = (best > config.tolerance).nonzero()[:, 0]
+    identity = torch.eye(3, dtype=start.dtype)
+    for _ in range(config.newton_steps):
+        if len(active) == 0:
+            break
+        J = jacobian[active]
+        normal = J.mT @ J + damping[active, None, None] * identity
+        step = torch.linalg.solve(normal, (J.mT @ residual[active][..., None]))[..., 0]
+        length = step.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        trial = X[active] + step * (config.newton_reach / length).clamp(max=1.0)
+        posed, J = _posed_with_jacobian(model, trial, state[active])
+        miss = target[active] - posed
+        better = miss.norm(dim=-1) < best[active]
+        chosen = active[better]
+        X[chosen], residual[chosen], jacobian[chosen] = trial[better], miss[better], J[better]
+        best[chosen] = miss[better].norm(dim=-1)
+        damping[active] = torch.where(better, damping[active] / 5, damping[active] * 8).clamp(1e-8, 1e4)
+        active = active[best[active] > config.tolerance]
+    return X, best
+
+
+def _posed_with_jacobian(
+    model: GarmentModel, X: Float[Tensor, "P 3"], state: BodyState
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
+    """M_G of loose points and dM_G/dX: each point is posed three times, once for each row of its Jacobian."""
+    copies = X.detach()[:, None].repeat(1, 3, 1).requires_grad_()
+    with torch.enable_grad():
+        posed = model.local_map(copies, state).posed(copies)
+        (jacobian,) = torch.autograd.grad(posed.diagonal(dim1=-2, dim2=-1).sum(), copies)
+    return posed[:, 0].detach(), jacobian
+
+
+def _neighbour_sum(values: Float[Tensor, "T N C"], faces: Int[Tensor, "M 3"]) -> Float[Tensor, "T N C"]:
+    """For each vertex the sum over the two other corners of each of its faces."""
+    total = torch.zeros_like(values)
+    for corner in range(3):
+        others = values[:, faces[:, corner - 1]] + values[:, faces[:, corner - 2]]
+        total.index_add_(1, faces[:, corner], others)
+    return total
 
 
 def _dilated(mask: Bool[Tensor, "T N"], faces: Int[Tensor, "M 3"]) -> Bool[Tensor, "T N"]:

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.body.skinning import blended_affine
 from workbench.collisions.diffused_body import Rigging
 from workbench.collisions.garment_model import BodyState, LocalMap
 from workbench.geometry.closest_point import ClosestPoint
@@ -38,9 +37,8 @@ def nearest_rigging(body: Body, points: Float[Tensor, "N 3"], surface: Float[Ten
 
 def unpose_with(rigging: Rigging, garment: Float[Tensor, "N 3"], state: BodyState) -> Float[Tensor, "N 3"]:
     """Inverse linear blend skinning with a given rigging: A^-1 (M_G - t) - B_s - B_p."""
-    rotation, translation = blended_affine(rigging.weights, state.transforms)
-    local = LocalMap(rotation, translation, rigging.offset)
-    return local.pulled_back(garment - translation) - local.offset
+    local = LocalMap.of(rigging, state)
+    return local.pulled_back(garment - local.translation) - local.offset
 
 
 def constant_weights(

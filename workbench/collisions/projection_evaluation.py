@@ -11,7 +11,7 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import GridSDF
-from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.diffused_body import GridFields, MonteCarloFields
 from workbench.collisions.garment_model import BodyState, GarmentModel
 from workbench.collisions.penetration import penetration
 from workbench.collisions.projection import Projection, ProjectionConfig, Projector
@@ -26,6 +26,7 @@ from workbench.motion import Motion
 
 MILLI = 1e3
 PERCENT = 100.0
+FLOOR_SAMPLES = 256
 SPREAD = 15.0  # degrees: what the published preprocessing does to every motion
 
 
@@ -35,8 +36,9 @@ class ProjectionEvaluation:
 
     sequences: Path | None = None  # folder of simulated sequences (.npz); default: those that ship
     motions: Path | None = None  # folder of motion files for the floor; default: those that ship
-    floor_shapes: int = 3  # random shapes, each with every motion
-    floor_frames: int = 90  # frames of each motion
+    floor_shapes: int = 2  # random shapes, each with every motion
+    floor_frames: int = 90  # of each motion, from its beginning
+    floor_every: int = 3  # frames: one in so many is posed and counted
     seed: int = 0
     projection: ProjectionConfig = ProjectionConfig()
 
@@ -182,16 +184,32 @@ def floor_rows(model: GarmentModel, config: ProjectionEvaluation) -> list[Row]:
     """facts.md 9: the static T-shirt through motions, raw, spread and cleared; by region; by skinning."""
     generator = torch.Generator().manual_seed(config.seed)
     betas = torch.randn(config.floor_shapes, model.body.shape_count, generator=generator).clamp(-2.5, 2.5)
-    motions = [motion.clip(0, min(len(motion), config.floor_frames)) for motion in _motions(config, model.body)]
+    motions = [_beginning(motion.resampled(30.0), config.floor_frames) for motion in _motions(config, model.body)]
     template = Garment.load("tshirt").vertices
     raw = [(motion, shape) for motion in motions for shape in betas]
     spread = [(with_arms_spread(motion, torch.pi / 180 * SPREAD), shape) for motion, shape in raw]
     cleared = [(motion.cleared(model.body, betas=shape), shape) for motion, shape in raw]
-    table = [told("floor: frames posed", sum(len(motion) for motion, _ in raw), "frames")]
-    for name, cases in (("raw", raw), (f"arms spread {SPREAD:.0f} degrees", spread), ("cleared", cleared)):
-        table += _floor_table(name, static_template_floor(model, template, cases))
-    dual = static_template_floor(model, template, cleared, dual_quaternions=True)
-    return table + _floor_table("cleared, dual quaternions", dual)
+    cases = {"raw": raw, f"arms spread {SPREAD:.0f} degrees": spread, "cleared": cleared}
+    thin = {name: [(_thinned(m, config.floor_every), shape) for m, shape in case] for name, case in cases.items()}
+    table = [told("floor: frames posed", sum(len(motion) for motion, _ in thin["raw"]), "frames")]
+    for name, case in thin.items():
+        table += _floor_table(name, static_template_floor(model, template, case))
+    dual = static_template_floor(model, template, thin["cleared"], skinning="dual_quaternion")
+    reference = GarmentModel(model.body, MonteCarloFields(model.body, samples=FLOOR_SAMPLES))
+    exact = static_template_floor(reference, template, thin["cleared"])
+    return [
+        *table,
+        *_floor_table("cleared, dual quaternions", dual),
+        *_floor_table(f"cleared, Monte-Carlo fields (N = {FLOOR_SAMPLES})", exact),
+    ]
+
+
+def _beginning(motion: Motion, frames: int) -> Motion:
+    return motion.clip(0, min(len(motion), frames))
+
+
+def _thinned(motion: Motion, every: int) -> Motion:
+    return replace(motion, rotations=motion.rotations[::every], translation=motion.translation[::every])
 
 
 def _floor_table(name: str, floor: Floor) -> list[Row]:

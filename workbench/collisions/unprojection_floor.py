@@ -12,13 +12,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from workbench.collisions.garment_model import GarmentModel
+from workbench.body.model import Body, Skinning
+from workbench.body.skinning import dual_quaternion
+from workbench.collisions.diffused_body import FieldValues
+from workbench.collisions.garment_model import GarmentModel, LocalMap
 from workbench.collisions.penetration import Penetration, penetration
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.motion import Motion
 
 REGIONS = ("torso", "arms", "legs", "head")
-FRAMES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,15 @@ def static_template_floor(
     template: Float[Tensor, "N 3"],
     motions: Iterable[tuple[Motion, Float[Tensor, "K"]]],
     *,
-    dual_quaternions: bool = False,
+    skinning: Skinning = "linear",
 ) -> Floor:
-    """Pose the template by Eq. 7 through motions, each on a body shape, and count what is inside."""
-    region = regions_of(model, template)
-    found = [_reposed(model, template, motion, betas, dual_quaternions) for motion, betas in motions]
+    """Pose the template by Eq. 7 through motions, each on a body shape, and count what is inside.
+
+    With "dual_quaternion", W is that blend for body and garment, and B_p, fitted to linear blending, is left out.
+    """
+    values = model.fields.at(template)
+    region = regions_of(model.body, values)
+    found = [_reposed(model, template, values, motion, betas, skinning) for motion, betas in motions]
     inside = torch.cat([p.inside for p in found])
     overlap = torch.cat([p.overlap for p in found])
     shares = {
@@ -51,32 +57,33 @@ def static_template_floor(
     return Floor(float(inside.float().mean()), float(overlap.float().mean()), shares, len(inside))
 
 
+@torch.no_grad()
 def _reposed(
-    model: GarmentModel, template: Float[Tensor, "N 3"], motion: Motion, betas: Float[Tensor, "K"], dual: bool
+    model: GarmentModel,
+    template: Float[Tensor, "N 3"],
+    values: FieldValues,
+    motion: Motion,
+    betas: Float[Tensor, "K"],
+    skinning: Skinning,
 ) -> Penetration:
-    state = model.state(motion.rotations, betas, motion.translation)
-    pose = model.posed_by_dual_quaternions if dual else model.posed
     garment, bodies = [], []
-    for start in range(0, len(motion), FRAMES_AT_ONCE):
-        part = slice(start, start + FRAMES_AT_ONCE)
-        garment.append(pose(template.expand(len(motion.translation[part]), -1, -1), state[part]))
-        bodies.append(
-            model.body.vertices(
-                motion.rotations[part],
-                betas,
-                motion.translation[part],
-                skinning="dual_quaternion" if dual else "linear",
-            )
-        )
-    return penetration(torch.cat(bodies), model.body.faces, torch.cat(garment))
+    for frame in range(len(motion)):
+        theta, shift = motion.rotations[frame], motion.translation[frame]
+        state = model.state(theta, betas, shift)
+        bodies.append(model.body.vertices(theta, betas, shift, skinning=skinning))
+        if skinning == "linear":
+            garment.append(LocalMap.of(values.rigging(betas, state.pose_coefficients), state).posed(template))
+        else:
+            rigging = values.rigging(betas, torch.zeros_like(state.pose_coefficients))
+            garment.append(dual_quaternion(template + rigging.offset, rigging.weights, state.transforms))
+    return penetration(torch.stack(bodies), model.body.faces, torch.stack(garment))
 
 
-def regions_of(model: GarmentModel, points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
-    """The body region whose joints hold the most weight at each canonical point: an index into REGIONS."""
-    weights = model.fields.at(points).weights
-    joint_region = torch.tensor([_region(name) for name in model.body.joint_names])
-    by_region = torch.stack([weights[:, joint_region == index].sum(dim=1) for index in range(len(REGIONS))], dim=1)
-    return by_region.argmax(dim=1)
+def regions_of(body: Body, values: FieldValues) -> Int[Tensor, "N"]:
+    """The body region whose joints hold the most weight at each point: an index into REGIONS."""
+    joint_region = torch.tensor([_region(name) for name in body.joint_names])
+    sums = [values.weights[:, joint_region == index].sum(dim=1) for index in range(len(REGIONS))]
+    return torch.stack(sums, dim=1).argmax(dim=1)
 
 
 def _region(joint: str) -> int:
