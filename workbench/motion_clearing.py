@@ -55,6 +55,7 @@ NAMES = (
 LIMBS = ("left arm", "right arm", "left leg", "right leg")
 REACH = 0.15  # metres: what is farther off is not looked at
 PAIR_REACH = 0.05  # the same between two limbs, beyond the contact distance
+FINGERS = 2.0  # samples are this much denser on the hand, where the surface is most curved
 DOUBTFUL_DEPTH = 0.01  # metres inside from which vertex normals are not believed: ours, measured
 CHUNK = 32  # frames posed at once: bounds the memory
 
@@ -70,10 +71,10 @@ class ClearingConfig:
     leg_near: float = 0.03  # the same between the legs (crotch)
     leg_far: float = 0.08
     smoothing: float = 0.08  # seconds tau: giving way starts about 4 tau before contact: ours, see the strips
-    margin: float = 0.0015  # metres aimed at beyond what is owed, against the gaps between samples
+    margin: float = 0.002  # metres aimed at beyond what is owed, against the gaps between samples
     tolerance: float = 0.001  # metres short of what is owed that still count as clear
     stiffness: float = 1e5  # mu, rad^2 / m^2: 1 mm of one sample weighs like 0.3 rad in one frame
-    all_samples: int = 400  # a limb, spread evenly over its vertices: what clear means
+    all_samples: int = 500  # a limb; what clear means: the vertices between lack up to 3 mm at fingertips, else < 1 mm
     samples: int = 100  # of these to start with; those that stay short are taken in: ours, an exchange method
     exchanges: int = 3
     rounds: int = 14  # linearisations at most
@@ -804,7 +805,13 @@ def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tup
             to_trunk = _owed(off, config.clearance, config.near, config.far)
             to_head = _owed(off, config.contact, config.near, config.far)
             to_other = _owed(apart.query(points).distance, config.contact, config.near, config.far)
-        chosen = _spread(points, np.maximum(to_trunk, to_other) > 0, config.all_samples)
+        cloud = points
+        if hinge is not None:
+            end = skeleton.children(hinge)[0]
+            joint = body.joints(betas)[end].numpy()
+            hand = np.isin(owner.numpy()[own], skeleton.descendants(end))[:, None]
+            cloud = np.where(hand, joint + FINGERS * (points - joint), points)
+        chosen = _spread(cloud, np.maximum(to_trunk, to_other) > 0, config.all_samples)
         by_root = body.weights[:, carried[name]].sum(1).double().numpy()
         below = torch.tensor(skeleton.descendants(hinge)) if hinge is not None else torch.zeros(0, dtype=torch.long)
         by_hinge = body.weights[:, below].sum(1).double().numpy()
