@@ -1,31 +1,45 @@
-"""Sec. 4.3's templates: MakeHuman's CC0 tights -> cut, hemmed, loosened, draped once.  -> workbench/assets/garments/*.npz
+"""Sec. 4.3's templates: MakeHuman's CC0 tights -> cut, hemmed, loosened, draped.  -> workbench/assets/garments/*.npz
 
-Cut: quads of the helper mesh above the hem line, up to the sleeve and outside the neck hole; the lower boundary is extruded to
-the hem (with flare: a skirt); every quad is split in four; smoothing against the wanted gap to the body gives the
+Cut: quads of the helper mesh above the hem line, up to the sleeve and below the neckline; the lower border is extruded
+to the hem (with flare: a skirt); every quad is split in four; smoothing against the wanted gap to the body gives the
 material's rest shape. Drape: that shape falls onto the mean body until it rests.
 """
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_array, coo_matrix, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from assets_gen.body import canonical_helpers
+from assets_gen.cloth_solver import ClothConfig, ClothSolver
 from workbench.body.model import Body
+from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
-from workbench.geometry.mesh import QuadMesh, boundary_loops, require_sheet, subdivide_quads, triangulate
+from workbench.geometry.mesh import (
+    QuadMesh,
+    boundary_loops,
+    require_sheet,
+    subdivide_quads,
+    triangulate,
+    vertex_normals,
+)
 from workbench.geometry.winding import InsideTest
+from workbench.store import add_to_manifest, code_version
 
 log = logging.getLogger(__name__)
 
 ISLAND = 25  # quads; a smaller patch left or lost by a cut is put right
 BUTTOCKS = 0.08  # metres below the hip joint where they end
-SHORT_EDGE = 0.009  # metres; the solver's self-contact (3 mm thick) must not see neighbours
+ARMPIT_REACH = 0.08  # metres from the armpit's middle to where the sheet leaves it in front and behind
+UNDERARM = 0.1  # metres around the armpits where the sheet may slide freely, lest it fold
+SLIDE = 0.2  # elsewhere: of the smoothing within the sheet; 1 across it
+SHORT_EDGE = 0.006  # metres; the solver's self-contact (3 mm thick) must not see neighbours
 RING = 0.026  # metres between extruded rings, before the subdivision halves it: the size of the helper's own quads
 
 
@@ -40,6 +54,7 @@ class Outfit:
     cut: float  # height above the hip joint where the tights end and the extrusion begins
     hem: float  # height above the hip joint of the hem; negative is below
     flare: float  # the hem is 1 + flare times as wide as the cut
+    armhole: float  # how far the garment stays below the armpits: cloth in there is pinched by every hanging arm
     gap_shoulder: float = 0.006  # wanted distance to the body, at shoulder height ...
     gap_belly: float = 0.022  # ... and at the height of the waist joint and below
     gap_sleeve: float = 0.018  # ... and at the end of the sleeve
@@ -49,12 +64,96 @@ class Outfit:
 # ours: drapes compared in pictures. Another upper-body garment is one more line, e.g. a tank top is sleeve=0.05.
 OUTFITS = {
     "tshirt": Outfit(
-        "tshirt", sleeve=0.70, neck_height=-0.004, neck_tilt=0.42, cut=0.12, hem=-0.04, flare=0.12, gap_belly=0.032
+        "tshirt",
+        sleeve=0.70,
+        neck_height=-0.004,
+        neck_tilt=0.42,
+        cut=0.12,
+        hem=-0.04,
+        flare=0.12,
+        armhole=0.042,
+        gap_belly=0.032,
     ),
     "dress": Outfit(
-        "dress", sleeve=0.48, neck_height=-0.02, neck_tilt=0.5, cut=0.12, hem=-0.40, flare=0.85, gap_belly=0.012
+        "dress",
+        sleeve=0.48,
+        neck_height=-0.02,
+        neck_tilt=0.5,
+        cut=0.12,
+        hem=-0.40,
+        flare=0.85,
+        armhole=0.038,
+        gap_belly=0.012,
     ),
 }
+
+
+@dataclass(frozen=True)
+class DrapeConfig:
+    """Quasi-static: the cloth falls until it rests."""
+
+    slowest: float = 0.0015  # m/s: at rest when the mean vertex is slower than this
+    frames: int = 240  # 8 s at most
+    cloth: ClothConfig = ClothConfig()
+
+
+@dataclass(frozen=True)
+class GarmentsConfig:
+    """Cut and drape the garments that ship."""
+
+    out: Path = Path("workbench/assets/garments")
+    only: tuple[str, ...] = ()  # names; empty: all
+    drape: DrapeConfig = DrapeConfig()
+
+
+def run(config: GarmentsConfig) -> tuple[Garment, ...]:
+    """Cut, drape, check and save; returns the garments."""
+    unknown = sorted(set(config.only) - set(OUTFITS))
+    if unknown:
+        raise ValueError(f"no outfit is called {', '.join(unknown)}; there are {', '.join(OUTFITS)}")
+    body, helpers, quads = Body.default(), canonical_helpers(), helper_quads()
+    garments = []
+    for name in config.only or OUTFITS:
+        cut = cut_garment(OUTFITS[name], body, helpers.vertices, quads)
+        draped = drape(cut, body, config.drape)
+        garment = Garment(
+            name=name,
+            vertices=torch.from_numpy(draped),
+            rest_vertices=torch.from_numpy(cut.vertices).float(),
+            faces=torch.from_numpy(cut.faces),
+        )
+        garment.require_fits(body)
+        garment.save(config.out / f"{name}.npz")
+        print(f"{config.out / f'{name}.npz'}: {len(draped)} vertices, {len(cut.faces)} faces")
+        manifest = config.out.parent / "manifest.json"
+        if manifest.exists():  # what ships is recorded; a try-out elsewhere is not
+            add_to_manifest(
+                manifest,
+                config.out / f"{name}.npz",
+                command=f"python -m assets_gen garments --only {name}",
+                config=[OUTFITS[name], config.drape],
+                licence="CC0-1.0",  # MakeHuman's helper geometry; the cut adds nothing that asks for more
+                code=code_version("assets_gen.garments", "assets_gen.cloth_solver"),
+                scores={"vertices": len(draped)},
+            )
+        garments.append(garment)
+    return tuple(garments)
+
+
+def drape(cut: "CutGarment", body: Body, config: DrapeConfig = DrapeConfig()) -> Float[np.ndarray, "N 3"]:
+    """Where the cut garment comes to rest on the canonical body.  Raises ValueError if it does not."""
+    still = body.template.numpy()
+    solver = ClothSolver(still, body.faces.numpy(), cut.vertices, cut.faces, config=config.cloth)
+    speed = np.inf
+    for _ in range(config.frames):
+        before = solver.positions
+        speed = float(np.linalg.norm(solver.advance(still) - before, axis=1).mean() * config.cloth.fps)
+        if speed < config.slowest and solver.frame > config.cloth.fps:
+            return solver.positions
+    raise ValueError(
+        f"the garment still moves at {1e3 * speed:.1f} mm/s after {config.frames} frames; expected rest below "
+        f"{1e3 * config.slowest:g} mm/s: drape longer or loosen the cut"
+    )
 
 
 @dataclass(frozen=True)
@@ -65,7 +164,9 @@ class CutGarment:
     faces: Int[np.ndarray, "F 3"]
 
 
-def cut_garment(outfit: Outfit, body: Body, helpers: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]) -> CutGarment:
+def cut_garment(
+    outfit: Outfit, body: Body, helpers: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]
+) -> CutGarment:
     """One manifold sheet outside of the canonical body.
 
     helpers: vertices of MakeHuman's full mesh in the canonical rest; quads: the tights' faces among them.
@@ -139,7 +240,7 @@ def _onto_cut(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarra
 
 
 def _wanted_gap(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarray]:
-    """Distance to the body that the rest shape keeps: loose at the belly and the sleeve's end, close at the shoulder."""
+    """Distance to the body that the rest shape keeps: loose at belly and sleeve end, close on the shoulder."""
 
     def gap(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         down = np.clip((at.shoulder[2] - points[:, 2]) / (at.shoulder[2] - at.waist[2]), 0, 1)
@@ -163,14 +264,14 @@ def _smooth_selection(
     shared = np.flatnonzero((sides[1:] == sides[:-1]).all(1))
     pairs = np.stack([owner[shared], owner[shared + 1]], 1)
     pairs = pairs[kept[pairs[:, 0]] == kept[pairs[:, 1]]]
-    label = _labels(pairs, len(quads))
-    return np.where(np.bincount(label)[label] < ISLAND, ~kept, kept)
+    part = _labels(pairs, len(quads))
+    return np.where(np.bincount(part)[part] < ISLAND, ~kept, kept)
 
 
 def _largest_part(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     pairs = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
-    label = _labels(pairs, len(vertices))[quads[:, 0]]
-    quads = quads[label == np.bincount(label).argmax()]
+    part = _labels(pairs, len(vertices))[quads[:, 0]]
+    quads = quads[part == np.bincount(part).argmax()]
     used, renumbered = np.unique(quads, return_inverse=True)
     return vertices[used].astype(float), renumbered.reshape(quads.shape)
 
@@ -210,47 +311,74 @@ def _relax(vertices: np.ndarray, quads: np.ndarray, body: Body, outfit: Outfit, 
     Boundary vertices average along the boundary only and stay in the plane of their cut.
     """
     inner, border, on_border = _averages(quads, len(vertices))
-    averages = np.where(on_border, 0, 1)[:, None], np.where(on_border, 1, 0)[:, None]
     gap, onto_cut = _wanted_gap(outfit, at), _onto_cut(outfit, at)
+    triangles = torch.from_numpy(np.concatenate([quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]))
     sides = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
     edges = np.unique(np.sort(sides, axis=1), axis=0)
     surface = body.template.double().numpy()
     closest, inside = ClosestPoint(surface, body.faces.numpy()), InsideTest(surface, body.faces.numpy())
+    armpit = _armpit(at, inside)
     for step in range(outfit.smoothing):
         skirt = vertices[:, 2] < at.hip[2] - BUTTOCKS
         strength = np.where(skirt & (step % 2 == 1), -0.53, 0.5)[:, None]
-        mean = averages[0] * (inner @ vertices) + averages[1] * (border @ vertices)
-        vertices = vertices + strength * (mean - vertices)
+        sheet = inner @ vertices - vertices
+        normals = vertex_normals(torch.from_numpy(vertices), triangles).numpy()
+        across = (sheet * normals).sum(1, keepdims=True) * normals
+        # Sliding within the sheet would crowd its rows towards the armpits, where the way around is shortest.
+        mirrored = np.column_stack([np.abs(vertices[:, 0]), vertices[:, 1:]])
+        free = skirt | (np.linalg.norm(mirrored - armpit, axis=1) < UNDERARM)
+        slide = np.where(free, 1.0, SLIDE)[:, None]
+        movement = np.where(on_border[:, None], border @ vertices - vertices, across + slide * (sheet - across))
+        vertices = vertices + strength * movement + _part_short_edges(vertices, edges)
         vertices[on_border] = onto_cut(vertices[on_border])
         push = _push_out(vertices, gap(vertices), closest, inside) - vertices
-        # In a crease (armpit) neighbours are pushed to and fro between the two sides; their mean leads out of it.
-        vertices = vertices + (push + inner @ push) / 2 + _part_short_edges(vertices, edges)
+        # In a crease neighbours are pushed to and fro between its two sides; their mean leads out of it.
+        vertices = vertices + (push + inner @ push) / 2
+        vertices = _below_armpits(vertices, armpit, outfit.armhole)
         vertices = _push_out(vertices, np.full(len(vertices), outfit.gap_shoulder), closest, inside)
     return vertices
 
 
-def _averages(quads: np.ndarray, count: int) -> tuple[csr_matrix, csr_matrix, np.ndarray]:
+def _armpit(at: Landmarks, inside: InsideTest) -> Float[np.ndarray, "3"]:
+    """Where a plumb line from the left shoulder joint leaves the body."""
+    down = at.shoulder - np.linspace(0, 0.3, 301)[:, None] * [0, 0, 1]
+    return down[np.argmin(inside(down))]
+
+
+def _below_armpits(vertices: np.ndarray, armpit: Float[np.ndarray, "3"], depth: float) -> np.ndarray:
+    """Down and out along the bisector of arm and torso, until a cylinder's depth below the armpit, less to its ends."""
+    mirror = np.where(vertices[:, :1] < 0, [-1, 1, 1], [1, 1, 1])
+    bisector = np.array([np.sin(np.pi / 8), 0, -np.cos(np.pi / 8)])  # of a plumb torso and an A45 arm
+    across = np.array([np.cos(np.pi / 8), 0, np.sin(np.pi / 8)])
+    place = vertices * mirror - armpit
+    wanted = depth * (1 - (place[:, 1] / ARMPIT_REACH) ** 2)
+    height = place @ bisector
+    under_the_arm = (height > 0) & (np.abs(place @ across) < ARMPIT_REACH / 2)
+    missing = np.where(under_the_arm, np.maximum(wanted - height, 0), 0)
+    return vertices + 0.3 * missing[:, None] * bisector * mirror
+
+
+def _push_out(vertices: np.ndarray, gap: np.ndarray, closest: ClosestPoint, inside: InsideTest) -> np.ndarray:
+    found, within = closest.query(vertices), inside(vertices)
+    distance = np.where(within, -found.distance, found.distance)
+    direction = (vertices - found.point) * np.where(within, -1, 1)[:, None]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-12
+    return np.where((distance < gap)[:, None], found.point + direction * gap[:, None], vertices)
+
+
+def _averages(quads: np.ndarray, count: int) -> tuple[csr_array, csr_array, np.ndarray]:
     """Row-stochastic neighbour means: over all neighbours, and over boundary neighbours."""
     sides = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
     edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     on_border = np.zeros(count, dtype=bool)
     on_border[edges[times == 1]] = True
 
-    def mean(pairs: np.ndarray) -> csr_matrix:
+    def mean(pairs: np.ndarray) -> csr_array:
         i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
         degree = np.maximum(np.bincount(i, minlength=count), 1)
-        return coo_matrix((1 / degree[i], (i, j)), shape=(count, count)).tocsr()
+        return coo_array((1 / degree[i], (i, j)), shape=(count, count)).tocsr()
 
     return mean(edges), mean(edges[times == 1]), on_border
-
-
-def _push_out(vertices: np.ndarray, gap: np.ndarray, closest: ClosestPoint, inside: InsideTest) -> np.ndarray:
-    found = closest.query(vertices)
-    within = inside(vertices)
-    distance = np.where(within, -found.distance, found.distance)
-    direction = (vertices - found.point) * np.where(within, -1, 1)[:, None]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-12
-    return np.where((distance < gap)[:, None], found.point + direction * gap[:, None], vertices)
 
 
 def _part_short_edges(vertices: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Sec. 6: simulated frames, the ground truth of everything after.  file <-> M_G (T,N,3), theta (T,J,3,3), beta (K,).
 
 Storage: positions relative to the root are rounded to 0.03 mm, and each is predicted from its own last frame and its
-neighbour's movement; what is left are small integers that compress to about 2 bytes a vertex and frame. Lossless after rounding.
+neighbour's movement; what is left are small integers that compress to about 2 bytes a vertex and frame. Lossless
+after rounding.
 """
 
 from collections.abc import Sequence
@@ -17,13 +18,16 @@ from torch import Tensor
 
 from workbench.geometry.mesh import unique_edges
 from workbench.geometry.rotations import matrix_to_quaternion, quaternion_to_matrix
+from workbench.npz import read_npz
 from workbench.store import atomic_write
 
 STORAGE_STEP = 3e-5  # metres; the stored error is at most half of it (the contract's bound: 0.02 mm)
 FORMAT = "simulated-sequence-1"
+STORED = ("format", "step", "residual", "rotations", "translation", "betas", "faces", "valid", "fps", "names")
+SHIPPED = Path(__file__).parents[1] / "assets" / "sequences"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedSequence:
     """A garment simulated on one body shape through one motion, at `fps`; metres, radians."""
 
@@ -84,23 +88,15 @@ class SimulatedSequence:
         planes = 1 if small.max(initial=0) < 256 else 2 if small.max(initial=0) < 65536 else 4
         stacked = np.ascontiguousarray(small.transpose(2, 1, 0)).astype(f"<u{planes}")
         arrays["residual"] = np.moveaxis(stacked[..., None].view(np.uint8), -1, 0)
-        with atomic_write(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **arrays)
+        with atomic_write(path) as part:
+            np.savez_compressed(part, **arrays)
 
     @staticmethod
     def load(path: str | Path) -> "SimulatedSequence":
-        """Raises ValueError for anything that `save` did not write."""
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {key: stored[key] for key in stored.files}
-        except (OSError, ValueError, EOFError, KeyError) as error:
-            if not Path(path).exists():
-                raise ValueError(f"{path}: no such file; expected a simulated sequence (npz)") from error
-            raise ValueError(f"{path}: expected a simulated sequence (npz), got an unreadable file: {error}") from error
-        if str(arrays.get("format", "")) != FORMAT:
-            raise ValueError(
-                f"{path}: expected a simulated sequence ({FORMAT}), got an npz with {', '.join(sorted(arrays))}"
-            )
+        """Raises FileNotFoundError, or ValueError for anything that `save` did not write."""
+        arrays = read_npz(path, "a simulated sequence", required=STORED)
+        if str(arrays["format"]) != FORMAT:
+            raise ValueError(f"{path} has format {str(arrays['format'])!r}; expected {FORMAT!r}")
         faces = arrays["faces"].astype(np.int64)
         planes = arrays["residual"]  # (bytes, 3, N, T)
         stacked = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{len(planes)}")[..., 0]
@@ -123,7 +119,21 @@ class SimulatedSequence:
         )
 
 
-@dataclass(frozen=True)
+def shipped_sequences() -> list[SimulatedSequence]:
+    """Every simulated sequence that ships, by file name."""
+    return [SimulatedSequence.load(path) for path in sorted(SHIPPED.glob("*.npz"))]
+
+
+def shipped_sequence(name: str) -> SimulatedSequence:
+    """The shipped sequence of that file name, such as "tshirt_demo".  Raises ValueError naming those there are."""
+    path = SHIPPED / f"{name}.npz"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.npz"))) or "none"
+        raise ValueError(f"no sequence {name!r} ships; there are: {known}")
+    return SimulatedSequence.load(path)
+
+
+@dataclass(frozen=True, eq=False)
 class SpanningTree:
     """Each vertex hangs on a neighbour; levels lists the vertices by their distance from the root."""
 

@@ -1,4 +1,4 @@
-"""Eq. 15's Laplacian: how a vertex differs from its neighbours.  faces (F,3) -> sparse L (V,V), (L x)_i = x_i - mean_j x_j."""
+"""Eq. 15's Laplacian: a vertex against its neighbours.  faces (F,3) -> sparse L (V,V), (L x)_i = x_i - mean_j x_j."""
 
 import torch
 from jaxtyping import Float, Int

@@ -1,7 +1,7 @@
 """Triangle meshes: what makes one usable, and what every stage measures on it.  vertices (V,3), faces (F,3) -> facts.
 
-A garment must be ONE orientable manifold sheet with its normals pointing away from the body; `require_sheet` says in one
-line what is wrong with any other mesh.
+A garment must be ONE orientable manifold sheet with its normals pointing away from the body; `require_sheet` says in
+one line what is wrong with any other mesh.
 """
 
 from dataclasses import dataclass
@@ -116,7 +116,7 @@ def boundary_loops(faces: Int[Tensor, "F 3"]) -> tuple[Int[Tensor, " L"], ...]:
         ValueError: a boundary vertex is where two loops touch (the mesh is pinched there).
     """
     directed = half_edges(faces)
-    edges, which, count = torch.unique(directed.sort(1).values, dim=0, return_inverse=True, return_counts=True)
+    _, which, count = torch.unique(directed.sort(1).values, dim=0, return_inverse=True, return_counts=True)
     border = directed[count[which] == 1].tolist()
     following = dict(border)
     if len(following) < len(border):
