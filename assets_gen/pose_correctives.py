@@ -13,32 +13,9 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.body.skinning import blended_affine, dual_quaternion, linear_blend
-from workbench.geometry.rotations import axis_angle_to_matrix
+from workbench.body_evaluation import CorrectivesError, sample_poses, skinning_error
 
 log = logging.getLogger(__name__)
-
-# Mean and standard deviation of each joint's rotation vector (x: flexion, y: about the front-back axis, z: about the
-# vertical), radians: everyday excursions, half of the anatomical range (ours).
-JOINT_SPREAD = {
-    "LeftUpLeg": ((-0.4, 0.0, 0.0), (0.50, 0.25, 0.25)),
-    "RightUpLeg": ((-0.4, 0.0, 0.0), (0.50, 0.25, 0.25)),
-    "LeftLeg": ((0.7, 0.0, 0.0), (0.50, 0.05, 0.10)),
-    "RightLeg": ((0.7, 0.0, 0.0), (0.50, 0.05, 0.10)),
-    "LeftFoot": ((0.0, 0.0, 0.0), (0.30, 0.10, 0.10)),
-    "RightFoot": ((0.0, 0.0, 0.0), (0.30, 0.10, 0.10)),
-    "LowerBack": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.15)),
-    "Spine": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.15)),
-    "Spine1": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.15)),
-    "Neck": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.20)),
-    "Neck1": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.20)),
-    "Head": ((0.0, 0.0, 0.0), (0.15, 0.10, 0.20)),
-    "LeftShoulder": ((0.0, 0.0, 0.0), (0.08, 0.12, 0.12)),
-    "RightShoulder": ((0.0, 0.0, 0.0), (0.08, 0.12, 0.12)),
-    "LeftArm": ((0.0, 0.0, 0.0), (0.55, 0.55, 0.55)),
-    "RightArm": ((0.0, 0.0, 0.0), (0.55, 0.55, 0.55)),
-    "LeftHand": ((0.0, 0.0, 0.0), (0.25, 0.25, 0.25)),
-    "RightHand": ((0.0, 0.0, 0.0), (0.25, 0.25, 0.25)),
-}
 
 
 @dataclass(frozen=True)
@@ -51,19 +28,6 @@ class CorrectivesConfig:
     rank: int = 24  # ours: see `held_out_error` against rank in the log
     largest_offset: float = 0.08  # metres; beyond it the blended rotation is near singular
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class CorrectivesError:
-    """RMS vertex distance to dual-quaternion skinning over poses, metres."""
-
-    linear: float
-    corrected: float
-
-    @property
-    def reduction(self) -> float:
-        """The share of linear blending's error that B_p removes."""
-        return 1.0 - self.corrected / self.linear
 
 
 def fit_pose_correctives(body: Body, config: CorrectivesConfig) -> Body:
@@ -105,22 +69,6 @@ def held_out_error(body: Body, config: CorrectivesConfig) -> CorrectivesError:
     return skinning_error(body, poses)
 
 
-def skinning_error(body: Body, poses: Float[Tensor, "A J 3 3"]) -> CorrectivesError:
-    """RMS over all vertices of each pose, averaged over poses."""
-    betas = body.mean_shape()
-    linear, corrected = [], []
-    for pose in poses:
-        target = body.vertices(pose, betas, skinning="dual_quaternion")
-        transforms = body.pose(pose, betas).transforms
-        linear.append(_rms(linear_blend(body.template, body.weights, transforms) - target))
-        corrected.append(_rms(body.vertices(pose, betas) - target))
-    return CorrectivesError(float(torch.stack(linear).mean()), float(torch.stack(corrected).mean()))
-
-
-def _rms(offset: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:
-    return offset.square().sum(dim=-1).mean().sqrt()
-
-
 def corrective_targets(body: Body, pose: Float[Tensor, "J 3 3"], largest: float) -> Float[Tensor, "V 3"]:
     """A(theta)^-1 (dual_quaternion - linear_blend): what B_p should be at each vertex, cut at `largest`."""
     transforms = body.pose(pose, body.mean_shape()).transforms
@@ -131,26 +79,3 @@ def corrective_targets(body: Body, pose: Float[Tensor, "J 3 3"], largest: float)
     identity = torch.eye(3, dtype=rotation.dtype)
     offset = torch.linalg.solve(rotation + 1e-5 * identity, gap[..., None])[..., 0]
     return offset.clamp(-largest, largest)
-
-
-def sample_poses(body: Body, count: int, generator: torch.Generator) -> Float[Tensor, "A J 3 3"]:
-    """Synthetic poses: independent Gaussian rotation vectors of everyday spread; knees and elbows bend one way only."""
-    vectors = torch.zeros(count, len(body.parents), 3)
-    for name, (mean, spread) in JOINT_SPREAD.items():
-        noise = torch.randn(count, 3, generator=generator)
-        vectors[:, body.joint_names.index(name)] = torch.tensor(mean) + torch.tensor(spread) * noise
-    for knee in ("LeftLeg", "RightLeg"):
-        index = body.joint_names.index(knee)
-        vectors[:, index, 0] = vectors[:, index, 0].clamp(0.0, 2.3)
-    _bend_elbows(vectors, body, generator)
-    return axis_angle_to_matrix(vectors)
-
-
-def _bend_elbows(vectors: Float[Tensor, "A J 3"], body: Body, generator: torch.Generator) -> None:
-    """Flexion turns the forearm forwards (-y), about the axis (arm x forward); pronation turns it about the arm."""
-    for side, sign in (("Left", 1.0), ("Right", -1.0)):
-        arm = torch.tensor([sign, 0.0, -1.0]) / 2**0.5
-        flexion_axis = torch.linalg.cross(arm, torch.tensor([0.0, -1.0, 0.0]))
-        draw = torch.rand(len(vectors), 2, generator=generator)
-        flexion, twist = 2.2 * draw[:, :1] ** 1.5, 0.8 * (2 * draw[:, 1:] - 1)
-        vectors[:, body.joint_names.index(side + "ForeArm")] = flexion * flexion_axis + twist * arm
