@@ -1,5 +1,6 @@
 """Every test runs with the shapes of workbench checked (jaxtyping + beartype), on one thread a process."""
 
+import logging
 import os
 
 # Before torch and numpy: two xdist workers share two cores, so each gets one thread.
@@ -29,6 +30,16 @@ def single_thread():
 def private_cache(tmp_path, monkeypatch):
     """No test reads or fills the user's cache."""
     monkeypatch.setenv("WORKBENCH_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(autouse=True)
+def own_logging():
+    """The commands set up logging onto the output of their test; it ends with the test."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @pytest.fixture(scope="session")

@@ -17,16 +17,6 @@ from workbench import __version__, cli
 from workbench.evaluation_table import at_most, told
 
 
-@pytest.fixture(autouse=True)
-def own_logging():
-    """The commands configure logging; what they set ends with the test."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-
-
 @dataclass(frozen=True)
 class FakeConfig:
     """A stage's config."""
