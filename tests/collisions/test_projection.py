@@ -11,9 +11,13 @@ from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.projection import (
     ProjectionConfig,
+    ProjectionJob,
     Projector,
     collision_energy,
     fixed_point,
+    levenberg_marquardt,
+    neighbour_table,
+    project_all,
     reconstruction_energy,
     strain_energy,
 )
@@ -87,6 +91,29 @@ def test_the_stated_error_is_the_error_of_eq_10(projector, model, sequence):
     projection = projector.project(garment, state)
     again = (garment - model.posed(projection.canonical, state)).norm(dim=-1)
     assert torch.allclose(again, projection.error, atol=1e-6)
+
+
+def test_sequences_together_are_sequences_one_by_one(projector, sequence):
+    _, garment, state = sequence
+    jobs = [ProjectionJob(projector, garment[:3], state[:3]), ProjectionJob(projector, garment[2:], state[2:])]
+    together = project_all(jobs, workers=2)
+    for job, found in zip(jobs, together, strict=True):
+        assert torch.equal(found.canonical, projector.project(job.garment, job.state).canonical)
+
+
+def test_newton_steps_find_what_the_fixed_point_circles_around(model, projector, sequence):
+    canonical, garment, state = sequence
+    far = canonical[2] + 0.03 * torch.randn(canonical[2].shape, generator=torch.Generator().manual_seed(1))
+    frame = torch.full((len(far),), 2)
+    X, error = levenberg_marquardt(model, garment[2], state[frame], far, ProjectionConfig(newton_steps=30))
+    assert error.max() < 1e-4
+    assert (X - canonical[2]).norm(dim=-1).max() < 1e-3
+
+
+def test_neighbours_are_those_that_share_an_edge(projector):
+    table = neighbour_table(projector.rest.faces, len(projector.template))
+    edges = {frozenset(e) for f in projector.rest.faces.tolist() for e in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0]))}
+    assert {frozenset((v, n)) for v, row in enumerate(table.tolist()) for n in row if n >= 0} == edges
 
 
 def test_each_step_of_the_fixed_point_contracts(model, projector, sequence):

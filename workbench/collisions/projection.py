@@ -4,7 +4,8 @@ Two steps.  Fixed-point unskinning, X <- X + A(X)^-1 (M_G - M_G(X)), starts at t
 almost everywhere.  What it leaves (vertices where space folds, or inside the body) is mended by minimising Eq. 9.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,7 @@ from workbench.geometry.strain import RestTriangles, deformation_gradient, green
 POINTS_AT_ONCE = 4096  # of the Newton steps: bounds the memory of their Jacobians
 
 Progress = Callable[[int], None]
+Guess = Callable[[Tensor, Tensor], Tensor]  # X (T,N,3), which are wrong (T,N) -> another start for those
 
 
 @dataclass(frozen=True)
@@ -110,11 +112,7 @@ class Projector:
             canonical[frame], errors[frame] = fixed_point(self.model, target, state[frame], start, self.config)
             start = canonical[frame]
             progress(1)
-        for guess in (
-            lambda bad: canonical,
-            lambda bad: self._carried(canonical, bad),
-            lambda bad: self._template(bad),
-        ):
+        for guess in (_as_they_are, self._carried, self._template):
             self._retry(garment, state, canonical, errors, guess)
         return Projection(canonical, errors, torch.zeros_like(errors, dtype=torch.bool))
 
@@ -124,13 +122,15 @@ class Projector:
         state: BodyState,
         canonical: Float[Tensor, "T N 3"],
         errors: Float[Tensor, "T N"],
-        guess: Callable[[Bool[Tensor, "T N"]], Float[Tensor, "T N 3"]],
+        guess: Guess,
     ) -> None:
         """Newton steps from another start for the vertices that are still wrong; the better answer stays (in place)."""
         bad = errors > self.config.mended_error
         if not bool(bad.any()):
             return
-        start = guess(bad)
+        frames = bad.any(dim=1).nonzero()[:, 0]
+        start = canonical.clone()
+        start[frames] = guess(canonical[frames], bad[frames])
         frame, vertex = bad.nonzero(as_tuple=True)
         for part in _chunks(len(frame), POINTS_AT_ONCE):
             pair = (frame[part], vertex[part])
@@ -141,18 +141,22 @@ class Projector:
 
     def _carried(self, canonical: Float[Tensor, "T N 3"], bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
         """Where the mesh around them would carry bad vertices: their neighbours' displacement from the template."""
-        displacement = torch.where(bad[..., None], 0.0, canonical - self.template)
-        known = (~bad).to(canonical.dtype)
+        frame, vertex = bad.nonzero(as_tuple=True)
+        table = neighbour_table(self.rest.faces, len(self.template))
+        around = table[vertex]  # -1 where a vertex has fewer neighbours
+        displacement, known = canonical - self.template, ~bad
         for _ in range(self.config.carry_steps):
-            total = _neighbour_sum(displacement, self.rest.faces)
-            weight = _neighbour_sum(known[..., None], self.rest.faces)
-            mean = total / weight.clamp_min(1e-9)
-            displacement = torch.where(bad[..., None], mean, displacement)
-            known = torch.where(bad, (weight[..., 0] > 0).to(known.dtype), known)
-        return self.template + displacement
+            counts = (around >= 0) & known[frame[:, None], around]
+            total = (displacement[frame[:, None], around] * counts[..., None]).sum(dim=1)
+            weight = counts.sum(dim=1)
+            reached = weight > 0
+            pair = (frame[reached], vertex[reached])
+            displacement[pair] = total[reached] / weight[reached, None]
+            known[pair] = True
+        return self.template + torch.where(known[..., None], displacement, 0.0)
 
-    def _template(self, bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
-        return self.template.expand(len(bad), -1, -1)
+    def _template(self, canonical: Float[Tensor, "T N 3"], bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
+        return self.template.expand_as(canonical)
 
     def mend(self, garment: Float[Tensor, "T N 3"], state: BodyState, start: Projection) -> Projection:
         """Minimise Eq. 9 over the vertices that unskinning left wrong or inside the body, and their neighbours.
@@ -160,11 +164,9 @@ class Projector:
         A vertex takes its new place only with its whole patch, and a frame's energy never rises.
         """
         canonical, errors, mended = start.canonical.clone(), start.error.clone(), start.mended.clone()
-        for frames in _chunks(len(garment), self.config.frames_at_once):
-            bad = self._needs_mending(canonical[frames], errors[frames])
-            if not bool(bad.any()):
-                continue
-            patch = self._patch(bad)
+        bad = self._needs_mending(canonical, errors)
+        for frames in bad.any(dim=1).nonzero()[:, 0].split(self.config.frames_at_once):
+            patch = self._patch(bad[frames])
             moved, error = self._minimise(garment[frames], state[frames], canonical[frames], patch)
             canonical[frames], errors[frames] = moved, torch.where(patch.free, error, errors[frames])
             mended[frames] = patch.free
@@ -265,6 +267,26 @@ class Projector:
 
 
 @dataclass(frozen=True)
+class ProjectionJob:
+    """A sequence to project: its projector (garment), its frames, the body states they were simulated on."""
+
+    projector: Projector
+    garment: Float[Tensor, "T N 3"]
+    state: BodyState
+
+
+def project_all(jobs: Sequence[ProjectionJob], workers: int = 2) -> list[Projection]:
+    """Many sequences at once, one thread each; the results do not depend on how many run together."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a thread a sequence beats threads inside small operations
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            return list(pool.map(lambda job: job.projector.project(job.garment, job.state), jobs))
+    finally:
+        torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True)
 class _Patch:
     """Loose (frame, vertex) pairs: those that may move, and a ring around them that holds still."""
 
@@ -346,13 +368,19 @@ def _posed_with_jacobian(
     return posed[:, 0].detach(), jacobian
 
 
-def _neighbour_sum(values: Float[Tensor, "T N C"], faces: Int[Tensor, "M 3"]) -> Float[Tensor, "T N C"]:
-    """For each vertex the sum over the two other corners of each of its faces."""
-    total = torch.zeros_like(values)
-    for corner in range(3):
-        others = values[:, faces[:, corner - 1]] + values[:, faces[:, corner - 2]]
-        total.index_add_(1, faces[:, corner], others)
-    return total
+def _as_they_are(canonical: Float[Tensor, "T N 3"], bad: Bool[Tensor, "T N"]) -> Float[Tensor, "T N 3"]:
+    return canonical
+
+
+def neighbour_table(faces: Int[Tensor, "M 3"], vertex_count: int) -> Int[Tensor, "N D"]:
+    """The vertices that share an edge with each vertex, padded with -1."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = torch.unique(torch.cat([edges, edges.flip(1)]), dim=0)
+    counts = torch.bincount(edges[:, 0], minlength=vertex_count)
+    first = counts.cumsum(0) - counts
+    table = torch.full((vertex_count, int(counts.max())), -1)
+    table[edges[:, 0], torch.arange(len(edges)) - first[edges[:, 0]]] = edges[:, 1]
+    return table
 
 
 def _dilated(mask: Bool[Tensor, "T N"], faces: Int[Tensor, "M 3"]) -> Bool[Tensor, "T N"]:
