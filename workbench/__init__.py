@@ -59,7 +59,7 @@ _HOME_OF = {
     "read_mesh_sequence": "workbench.formats.mesh_sequence",
 }
 
-__all__ = ["__version__", *_HOME_OF]
+__all__ = ["__version__", *_HOME_OF]  # pyright: ignore[reportUnsupportedDunderAll]  (the table is the list)
 
 
 def __getattr__(name: str) -> Any:
