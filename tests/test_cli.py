@@ -163,7 +163,7 @@ def test_bad_value_found_by_a_stage_is_one_line(capsys, fake_stage):
 def test_missing_extra_is_one_line(capsys, fake_stage, monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)
     line = refused(capsys, ["train", "fields", "--fault", "missing"])
-    assert line.endswith("'newton', which is not installed: run pip install 'garment-workbench[assets]'")
+    assert line.endswith("'newton', which is not installed: run pip install -c constraints.txt -e '.[assets]'")
 
 
 @pytest.mark.parametrize("fault", ["theirs", "broken"])

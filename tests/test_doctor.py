@@ -59,7 +59,7 @@ def test_missing_things_name_their_command(monkeypatch, tmp_path):
     assert doctor.disk(tmp_path, enough=0.0).well
     monkeypatch.setitem(doctor.EXTRAS, "lab", ("json", "no_such_module"))
     check = doctor.extra("lab")
-    assert (check.found, check.mend) == ("lacks no_such_module", "pip install 'garment-workbench[lab]'")
+    assert (check.found, check.mend) == ("lacks no_such_module", "pip install -c constraints.txt -e '.[lab]'")
     monkeypatch.setattr(doctor, "OLDEST_PYTHON", (99, 0))
     assert doctor.python().mend == "apt-get install -y python99.0"
 

@@ -16,7 +16,8 @@ class MissingExtra(ImportError):
 
 
 def install_command(extra: str) -> str:
-    return f"pip install 'garment-workbench[{extra}]'"
+    """From a checkout: the package is not on an index."""
+    return f"pip install -c constraints.txt -e '.[{extra}]'"
 
 
 def missing_extra(error: ImportError) -> MissingExtra | None:
