@@ -12,7 +12,7 @@ from workbench.extras import EXTRAS, MissingExtra, require
 
 def test_missing_extra_names_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)  # import newton raises ModuleNotFoundError
-    with pytest.raises(MissingExtra, match=r"run pip install 'garment-workbench\[assets\]'") as missing:
+    with pytest.raises(MissingExtra, match=r"run pip install -c constraints.txt -e '\.\[assets\]'") as missing:
         require("newton", extra="assets")
     assert "\n" not in str(missing.value)
 
