@@ -1,6 +1,7 @@
-"""4.3, Eq. 12: signed distance to the constant canonical body.  p (N,3) -> SDF (N,), positive outside, differentiable in p.
+"""4.3, Eq. 12: signed distance to the constant canonical body.  p (N,3) -> SDF (N,), positive outside.
 
-Three implementations of one interface: exact (BVH and winding number), learned (SIREN), tabulated (adaptive grid).
+Three implementations of one interface, all differentiable in p: exact (BVH and winding number), learned (SIREN),
+tabulated (adaptive grid).
 """
 
 from abc import ABC, abstractmethod
@@ -57,7 +58,7 @@ class _ExactDistance(torch.autograd.Function):
 
 
 class LearnedSDF(BodySDF):
-    """The paper's network: 5 sine layers of 256, omega_0 = 30 in all, linear out (facts.md 1).  Metres in, metres out."""
+    """The paper's network: 5 sine layers of 256, omega_0 = 30 in all, linear out (facts.md 1).  Metres in and out."""
 
     def __init__(self, body: Body, *, width: int = 256, depth: int = 5, generator: torch.Generator | None = None):
         self.low = body.template.amin(0) - BOX_MARGIN

@@ -291,8 +291,8 @@ def body_fingerprint(body: Body) -> str:
 
 
 class LearnedFields(DiffusedFields):
-    """The paper's three networks: W~ p -> J with softmax, B~s concat(p, beta) -> 3, B~p concat(p, pose feature) -> 3; each
-    of 5 hidden layers of 256 with ReLU (facts.md 1).
+    """The paper's three networks: W~ p -> J with softmax, B~s concat(p, beta) -> 3, B~p concat(p, pose feature) -> 3;
+    each of 5 hidden layers of 256 with ReLU (facts.md 1).
 
     Ours: p is centred and scaled to the unit box; the pose feature is projected onto what B_p can see of it
     (feature @ pose_map @ pinv(pose_map)), which changes no value of B_p and spares the network 246 idle directions; the
@@ -402,8 +402,8 @@ POSE_SPREAD = 0.25  # typical coefficient of a pose direction over random poses
 
 
 class GridFields(LinearFields):
-    """Eq. 4-6 read off a table: eight rows a point, the exact gradient of the interpolant; outside of the box, the value
-    at its border."""
+    """Eq. 4-6 read off a table: eight rows a point, the exact gradient of the interpolant; outside of the box, the
+    value at its border."""
 
     def __init__(self, grid: FieldGrid, body: Body):
         self.layout = FieldLayout.of(body)

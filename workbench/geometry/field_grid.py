@@ -1,9 +1,9 @@
 """A field of many channels tabulated on an adaptive grid: p (N,3) -> (N,C), continuous, differentiable in p.
 
-An octree: root cells of one size, a cell split in eight where trilinear interpolation from its corners errs too much. What is
-stored is the surplus of each new node over the interpolation of its parent cell, in integers: sparse where the field is
-smooth, hence small on disk. A node on the border to an unsplit cell keeps surplus zero, so the field is continuous. A
-lookup reads the eight corners of one leaf.
+An octree: root cells of one size, a cell split in eight where trilinear interpolation from its corners errs too much.
+What is stored is the surplus of each new node over the interpolation of its parent cell, in integers: mostly small,
+hence small on disk.  A node on the border to an unsplit cell keeps surplus zero, so the field is continuous.  A lookup
+reads the eight corners of one leaf.
 """
 
 import zipfile
@@ -58,7 +58,7 @@ class CompactGrid:
 
 @dataclass(frozen=True)
 class Leaf:
-    """Where points lie: corner nodes of their leaf cells and the corners' weights, local coordinates, edge length [m]."""
+    """Where points lie: corner nodes of their leaf cells, the corners' weights, local coordinates, edge length [m]."""
 
     nodes: Int[Tensor, "N 8"]
     weights: Float[Tensor, "N 8"]
@@ -170,9 +170,7 @@ class FieldGrid:
             ]
 
             def launch(start: int, stop: int) -> None:
-                wp.launch(
-                    locate_in_octree, dim=stop - start, inputs=[start, *inputs], device="cpu", record_tape=False
-                )
+                wp.launch(locate_in_octree, dim=stop - start, inputs=[start, *inputs], device="cpu", record_tape=False)
 
             run_chunks(launch, count, chunk=1 << 15)
         return Leaf(*(torch.from_numpy(array) for array in (nodes, weights, local, size)))
@@ -205,10 +203,7 @@ class _Lookup(torch.autograd.Function):
         grid, grad = ctx.grid, grad_outputs[0]
         table = _table(grid, points)
         gradient = torch.stack(
-            [
-                (weighted_rows(table, nodes, slope) * grad).sum(-1) / size
-                for slope in trilinear_slopes(local)
-            ],
+            [(weighted_rows(table, nodes, slope) * grad).sum(-1) / size for slope in trilinear_slopes(local)],
             dim=-1,
         )
         outside = (points < grid.low.to(points)) | (points > grid.high.to(points))
@@ -255,7 +250,9 @@ class GridConfig:
 
     root_size: float = 0.128
     depth: int = 4
-    worth_asking: float = 1.5  # a cell is examined only where its parent's error was this many tolerances (it falls 4-fold)
+    worth_asking: float = (
+        1.5  # a cell is examined only where its parent's error was this many tolerances (it falls 4-fold)
+    )
 
 
 @dataclass(frozen=True)
@@ -265,9 +262,7 @@ class Quantisation:
     step: Float[np.ndarray, "C"]
     simplex: tuple[int, int] | None = None
 
-    def encode(
-        self, exact: Float[np.ndarray, "n C"], interpolated: Float[np.ndarray, "n C"]
-    ) -> Int[np.ndarray, "n C"]:
+    def encode(self, exact: Float[np.ndarray, "n C"], interpolated: Float[np.ndarray, "n C"]) -> Int[np.ndarray, "n C"]:
         """Integers k with interpolated + k step ~ exact."""
         code = np.rint((exact - interpolated) / self.step).astype(np.int32)
         if self.simplex is not None and len(code):
@@ -294,8 +289,8 @@ def tabulate(
 ) -> FieldGrid:
     """Tabulate `field` over the box [low, high] (grown to whole root cells).
 
-    `error(surplus, points)` says how many tolerances a deviation is at a point: cells err at most about 1 afterwards, or
-    have reached the last level.  `progress(level, cells examined, nodes evaluated)` reports.
+    `error(surplus, points)` says how many tolerances a deviation is at a point: cells err at most about 1 afterwards,
+    or have reached the last level.  `progress(level, cells examined, nodes evaluated)` reports.
     """
     low = np.asarray(low, np.float64)
     shape = tuple(int(n) for n in np.maximum(1, np.ceil((high - low) / config.root_size - 1e-6)))
@@ -338,13 +333,13 @@ def _octant_errors(errors: Float[np.ndarray, "m 19"]) -> Float[np.ndarray, "m 8"
     """The largest error among the new nodes around each of a cell's eight children."""
     lattice = LATTICE[IS_NEW]
     touching = (np.abs(lattice[None] - 2 * CORNERS[:, None]) <= 1).all(-1)  # (8, 19)
-    return np.stack([errors[:, mask].max(1, initial=0) for mask in touching], axis=1)
+    return np.stack([errors[:, touching[child]].max(1, initial=0) for child in range(8)], axis=1)
 
 
 def refine(
     places: Int[np.ndarray, "m 3"], corners: Int[np.ndarray, "m 8"], level: int, shape: tuple[int, int, int]
 ) -> Refinement:
-    """The nodes that splitting the given cells of `level` adds.  places: cells' lower corners, in cells of that level."""
+    """The nodes that splitting cells of `level` adds.  places: their lower corners, in cells of that level."""
     extent = np.array(shape, np.int64) << (level + 1)  # of the box, in cells of the new level
     stride = np.array([(extent[1] + 1) * (extent[2] + 1), extent[2] + 1, 1])
     lattice = LATTICE[IS_NEW]

@@ -1,4 +1,4 @@
-"""Points to ask fields at: on a surface, in a shell around it, in a box; Gaussian directions.  generator -> points (N,3)."""
+"""Points to ask fields at: on a surface, in a shell around it, in a box; normal directions.  generator -> (N,3)."""
 
 from dataclasses import dataclass
 

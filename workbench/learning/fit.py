@@ -1,7 +1,7 @@
-"""The one optimisation loop: parameters, a loss a step -> trained parameters, a checkpoint that resumes to the same result.
+"""The one optimisation loop: parameters, a loss a step -> trained parameters, a checkpoint that resumes.
 
-A run that is killed continues from its checkpoint with the same parameters, Adam moments, step and generator state, so it
-ends where the uninterrupted run ends (bit by bit on one thread).
+A run that is killed continues from its checkpoint with the same parameters, Adam moments, step and generator state, so
+it ends where the uninterrupted run ends (bit by bit on one thread).
 """
 
 import json
@@ -36,8 +36,8 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a run reports: the step it stood at when it began (0 unless resumed), steps done in all, mean loss of the last
-    tenth of the steps it ran itself."""
+    """What a run reports: the step it stood at when it began (0 unless resumed), steps done in all, mean loss of the
+    last tenth of the steps it ran itself."""
 
     resumed_at: int
     steps: int
@@ -65,10 +65,10 @@ def fit(
 ) -> FitResult:
     """Minimise `loss_of(step, generator)` over `parameters`, in place.
 
-    All chance of a step must come from `generator`, or a resumed run differs.  `checkpoint` (safetensors) is written every
-    `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.  `watch(step,
-    loss)` is called after each step (logging).  Raises ValueError for a checkpoint of other parameters or another config,
-    FloatingPointError when the loss is not finite.
+    All chance of a step must come from `generator`, or a resumed run differs.  `checkpoint` (safetensors) is written
+    every `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.
+    `watch(step, loss)` is called after each step (logging).  Raises ValueError for a checkpoint of other parameters or
+    another config, FloatingPointError when the loss is not finite.
     """
     parameters = list(parameters)
     optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
