@@ -24,7 +24,10 @@ from tqdm import tqdm
 from assets_gen.cloth_solver import ClothConfig, ClothSolver
 from assets_gen.motions import generate
 from workbench.body.model import Body
+from workbench.cli import plugged_in
 from workbench.collisions.sequences import SimulatedSequence
+from workbench.demo import DemoConfig
+from workbench.demo import run as dress_another_shape
 from workbench.extras import require
 from workbench.formats import load_motion
 from workbench.garments import Garment
@@ -76,6 +79,8 @@ class SimulationsConfig:
     """copy the sequences of the default set that ship into workbench/assets/sequences"""
     clear: bool = True
     """rotate limbs clear of the body first"""
+    project: bool = True
+    """with --motion: also project the sequence, put it on another shape, count collisions and draw it"""
     record: RecordConfig = RecordConfig()
 
 
@@ -148,7 +153,19 @@ def run(config: SimulationsConfig) -> tuple[Path, ...]:
                 _ship(path, task)
     if failures:
         raise ValueError(f"{len(failures)} of {len(tasks)} simulations failed: {'; '.join(failures)}")
+    if config.motion is not None and config.project:
+        for path in paths:
+            if path is not None:
+                _project(path)
     return tuple(path for path in paths if path is not None)
+
+
+def _project(path: Path) -> None:
+    """The rest of the spine for one sequence: canonical space, another shape, counted and pictured, beside the file."""
+    folder = path.with_suffix("")
+    result = dress_another_shape(DemoConfig(out=folder, sequence=str(path)), plugged_in("workbench.pictures", "demo"))
+    print(json.dumps(result.report, indent=1))
+    print(f"written: {', '.join(str(file) for file in sorted(folder.glob('*')))}")
 
 
 def _asked_task(body: Body, config: SimulationsConfig) -> Task:
