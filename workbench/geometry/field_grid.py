@@ -332,8 +332,8 @@ def tabulate(
 def _octant_errors(errors: Float[np.ndarray, "m 19"]) -> Float[np.ndarray, "m 8"]:
     """The largest error among the new nodes around each of a cell's eight children."""
     lattice = LATTICE[IS_NEW]
-    touching = (np.abs(lattice[None] - 2 * CORNERS[:, None]) <= 1).all(-1)  # (8, 19)
-    return np.stack([errors[:, touching[child]].max(1, initial=0) for child in range(8)], axis=1)
+    touching = [(np.abs(lattice - 2 * corner) <= 1).all(-1) for corner in CORNERS]
+    return np.stack([errors[:, nodes].max(1, initial=0) for nodes in touching], axis=1)
 
 
 def refine(
