@@ -12,7 +12,9 @@ def test_bounds_are_inclusive_and_nan_never_holds():
     assert at_least("a", 50, "x", 50).holds and not at_least("a", 49.9, "x", 50).holds
     assert within("a", 0.5, "", 0, 1).holds and not within("a", 1.5, "", 0, 1).holds
     nan = float("nan")
-    assert not any(row.holds for row in (at_most("a", nan, "", 1), at_least("a", nan, "", 1), within("a", nan, "", 0, 1)))
+    assert not any(
+        row.holds for row in (at_most("a", nan, "", 1), at_least("a", nan, "", 1), within("a", nan, "", 0, 1))
+    )
 
 
 def test_a_told_figure_judges_nothing():

@@ -1,9 +1,11 @@
 """`workbench evaluate fields`: Eq. 4-6 and the SDF of Eq. 12, three implementations each.  body -> rows of figures."""
 
+import logging
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from workbench.body_evaluation import body_rows
 from workbench.collisions.body_sdf import BodySDF, ExactSDF, GridSDF, LearnedSDF
 from workbench.collisions.diffused_body import (
     BOX_MARGIN,
+    FIELDS_FOLDER,
     DiffusedFields,
     GridFields,
     LearnedFields,
@@ -26,6 +29,8 @@ from workbench.collisions.field_training import random_pose_features
 from workbench.evaluation_table import Row, at_least, at_most, told
 from workbench.garments import Garment
 from workbench.geometry.sampling import sample_box, sample_surface
+
+log = logging.getLogger(__name__)
 
 MILLI = 1e3
 PERCENT = 100.0
@@ -70,7 +75,7 @@ def _rows(config: FieldEvaluation) -> list[Row]:
     body = Body.default()
     grid, grid_sdf = GridFields.default(), GridSDF.default()
     learned = LearnedFields.load(config.networks, body) if config.networks else LearnedFields.default(body)
-    learned_sdf = LearnedSDF.load(config.networks, body) if config.networks else LearnedSDF.default(body)
+    learned_sdf = _learned_sdf(config, body)
     templates = {name: Garment.load(name).vertices for name in ("tshirt", "dress")}
     table = body_rows(body)
     for name, points in templates.items():
@@ -81,16 +86,14 @@ def _rows(config: FieldEvaluation) -> list[Row]:
     exact = ExactSDF(body)
     for name, points in templates.items():
         truth = exact(points)
-        table += [
-            at_most(f"SDF at the {name}: tabulated, mean", MILLI * _mean_error(grid_sdf, points, truth), "mm", 0.20),
-            at_most(
-                f"SDF at the {name}: learned, mean",
-                MILLI * _mean_error(learned_sdf, points, truth),
-                "mm",
-                PUBLISHED_SDF[name],
-            ),
-        ]
-    table += surface_rows(body, exact, learned_sdf, grid_sdf, config)
+        tabulated = MILLI * _mean_error(grid_sdf, points, truth)
+        table.append(at_most(f"SDF at the {name}: tabulated, mean", tabulated, "mm", 0.20))
+        if learned_sdf is not None:
+            error = MILLI * _mean_error(learned_sdf, points, truth)
+            table.append(at_most(f"SDF at the {name}: learned, mean", error, "mm", PUBLISHED_SDF[name]))
+    table += surface_rows(body, exact, grid_sdf, config)
+    if learned_sdf is not None:
+        table += learned_surface_rows(body, exact, learned_sdf, config)
     table += sdf_timing_rows(templates["tshirt"], exact, learned_sdf, grid_sdf, config)
     return table
 
@@ -272,58 +275,92 @@ def median_times(calls: list[Callable[[], object]], repeats: int) -> list[float]
 # The signed distance
 
 
-def surface_rows(body: Body, exact: ExactSDF, learned: LearnedSDF, grid: GridSDF, config: FieldEvaluation) -> list[Row]:
-    """On the surface, a little off it, and in the whole box."""
+def _learned_sdf(config: FieldEvaluation, body: Body) -> LearnedSDF | None:
+    """The trained network, or None where there is none yet: it does not ship, `workbench train fields` makes it."""
+    folder = config.networks or FIELDS_FOLDER
+    if not (folder / "sdf.safetensors").is_file():
+        log.warning("no learned SDF in %s: its rows are left out; `workbench train fields` trains it", folder)
+        return None
+    return LearnedSDF.load(folder, body)
+
+
+@dataclass(frozen=True)
+class SurfaceProbe:
+    """Points on the surface, moved off it along the normal, and in the box; with their exact distances."""
+
+    surface: Float[Tensor, "N 3"]
+    slender: Bool[Tensor, "N"]  # on hands and feet
+    moved: dict[float, tuple[Float[Tensor, "_ 3"], Float[Tensor, "_"]]]  # by millimetres off the surface
+    box: tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]
+
+
+def surface_probe(body: Body, exact: ExactSDF, config: FieldEvaluation) -> SurfaceProbe:
+    """Where the SDFs are judged; the same points for each of them."""
     generator = np.random.default_rng(config.seed)
     vertices, faces = body.template.numpy(), body.faces.numpy()
     samples = sample_surface(vertices, faces, config.surface_points, generator)
     surface = torch.from_numpy(samples.point)
     slender = hands_and_feet(body)[body.faces[torch.from_numpy(samples.face)]].any(1)
-    of_grid, of_net = grid(surface).abs(), learned(surface).abs()
-    table = [
-        told("SDF on the surface: tabulated, mean", MILLI * float(of_grid.mean()), "mm"),
-        at_most("SDF on the surface: tabulated, max", MILLI * float(of_grid[~slender].max()), "mm", 3.0),
-        at_most("SDF on hands and feet: tabulated, max", MILLI * float(of_grid[slender].max()), "mm", 6.0),
-        at_most("SDF on the surface: learned, mean", MILLI * float(of_net.mean()), "mm", 1.0),
-        at_most("SDF on the surface: learned, p95", MILLI * float(of_net.quantile(0.95)), "mm", 3.5),
-        at_most("SDF on the surface: learned, max", MILLI * float(of_net.max()), "mm", 7.5),
-    ]
-    # outside, inside: bounds of the learned one are the published network's (8.4 % at +1 mm, 11.8 % at -5 mm)
-    for offset, grid_bound, net_bound in ((1.0, 1.0, 8.4), (-1.0, 1.0, None), (5.0, 0.0, None), (-5.0, 0.0, 11.8)):
+    moved = {}
+    for offset in (1.0, -1.0, 5.0, -5.0):
         points = surface + torch.from_numpy(samples.normal) * (offset / MILLI)
         truth = exact(points)
         # where the surface folds, a point moved off one side is nearer to another: those are not at this distance
         there = (truth * MILLI / offset > 0.9).nonzero()[:, 0]
-        where = f"sign wrong {abs(offset):g} mm {'outside' if offset > 0 else 'inside'}"
-        wrong_net = _share_wrong(learned, points[there], truth[there])
-        table.append(at_most(f"{where}: tabulated", _share_wrong(grid, points[there], truth[there]), "%", grid_bound))
-        table.append(
-            told(f"{where}: learned", wrong_net, "%")
-            if net_bound is None
-            else at_most(f"{where}: learned", wrong_net, "%", net_bound)
-        )
-    points = torch.from_numpy(
+        moved[offset] = (points[there], truth[there])
+    box = torch.from_numpy(
         sample_box(vertices.min(0) - BOX_MARGIN, vertices.max(0) + BOX_MARGIN, config.surface_points, generator)
     )
-    truth = exact(points)
-    return [
-        *table,
-        at_most("SDF in the box of 0.5 m around: tabulated, mean", MILLI * _mean_error(grid, points, truth), "mm", 2.0),
-        at_most(
-            "SDF in the box of 0.5 m around: learned, mean", MILLI * _mean_error(learned, points, truth), "mm", 179.0
-        ),
+    return SurfaceProbe(surface, slender, moved, (box, exact(box)))
+
+
+def surface_rows(body: Body, exact: ExactSDF, grid: GridSDF, config: FieldEvaluation) -> list[Row]:
+    """The table on the surface, a little off it, and in the whole box."""
+    probe = surface_probe(body, exact, config)
+    found = grid(probe.surface).abs()
+    table = [
+        told("SDF on the surface: tabulated, mean", MILLI * float(found.mean()), "mm"),
+        at_most("SDF on the surface: tabulated, max", MILLI * float(found[~probe.slender].max()), "mm", 3.0),
+        at_most("SDF on hands and feet: tabulated, max", MILLI * float(found[probe.slender].max()), "mm", 6.0),
     ]
+    for offset, bound in ((1.0, 1.0), (-1.0, 1.0), (5.0, 0.0), (-5.0, 0.0)):
+        wrong = _share_wrong(grid, *probe.moved[offset])
+        table.append(at_most(f"sign wrong {_side(offset)}: tabulated", wrong, "%", bound))
+    far = MILLI * _mean_error(grid, *probe.box)
+    return [*table, at_most("SDF in the box of 0.5 m around: tabulated, mean", far, "mm", 2.0)]
+
+
+def learned_surface_rows(body: Body, exact: ExactSDF, learned: LearnedSDF, config: FieldEvaluation) -> list[Row]:
+    """The network in the same places; its bounds are the published network's (facts.md 1)."""
+    probe = surface_probe(body, exact, config)
+    found = learned(probe.surface).abs()
+    table = [
+        at_most("SDF on the surface: learned, mean", MILLI * float(found.mean()), "mm", 1.0),
+        at_most("SDF on the surface: learned, p95", MILLI * float(found.quantile(0.95)), "mm", 3.5),
+        at_most("SDF on the surface: learned, max", MILLI * float(found.max()), "mm", 7.5),
+    ]
+    for offset, bound in ((1.0, 8.4), (-5.0, 11.8)):
+        wrong = _share_wrong(learned, *probe.moved[offset])
+        table.append(at_most(f"sign wrong {_side(offset)}: learned", wrong, "%", bound))
+    far = MILLI * _mean_error(learned, *probe.box)
+    return [*table, at_most("SDF in the box of 0.5 m around: learned, mean", far, "mm", 179.0)]
+
+
+def _side(offset: float) -> str:
+    return f"{abs(offset):g} mm {'outside' if offset > 0 else 'inside'}"
 
 
 def sdf_timing_rows(
-    points: Float[Tensor, "N 3"], exact: ExactSDF, learned: LearnedSDF, grid: GridSDF, config: FieldEvaluation
+    points: Float[Tensor, "N 3"], exact: ExactSDF, learned: LearnedSDF | None, grid: GridSDF, config: FieldEvaluation
 ) -> list[Row]:
     """One evaluation at a garment's vertices, one thread."""
-    calls: list[Callable[[], object]] = [lambda: exact(points), lambda: learned(points), lambda: grid(points)]
-    names = ("exact", "learned", "tabulated")
+    sdfs: dict[str, BodySDF] = {"exact": exact, "tabulated": grid}
+    if learned is not None:
+        sdfs["learned"] = learned
+    calls: list[Callable[[], object]] = [partial(sdf, points) for sdf in sdfs.values()]
     return [
         told(f"SDF at {len(points):,} points, one thread: {name}", MILLI * seconds, "ms")
-        for name, seconds in zip(names, median_times(calls, max(3, config.repeats // 4)), strict=True)
+        for name, seconds in zip(sdfs, median_times(calls, max(3, config.repeats // 4)), strict=True)
     ]
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from torch import Tensor
@@ -32,11 +32,11 @@ class SimulatedSequence:
     """A garment simulated on one body shape through one motion, at `fps`; metres, radians."""
 
     garment: Float[Tensor, "T N 3"]
-    rotations: Float[Tensor, "T J 3 3"]  # theta: local rotations
-    translation: Float[Tensor, "T 3"]
+    rotations: Float[Tensor, "_ J 3 3"]  # theta (T,J,3,3): local rotations; _ is T, whose agreement is checked below
+    translation: Float[Tensor, "_ 3"]
     betas: Float[Tensor, " K"]
     faces: Int[Tensor, "F 3"]
-    valid: Bool[Tensor, " T"]  # the frame passed the quality check: nothing inside the body, stretch within bounds
+    valid: Bool[Tensor, " _"]  # the frame passed the quality check: nothing inside the body, stretch within bounds
     fps: float
     garment_name: str
     motion_name: str
@@ -182,12 +182,12 @@ def restore(residual: Int[np.ndarray, "T N 3"], tree: SpanningTree) -> Int[np.nd
     return np.cumsum(moved, axis=0, dtype=np.int32)
 
 
-def zigzag(signed: Int[np.ndarray, "*S"]) -> Int[np.ndarray, "*S"]:
+def zigzag(signed: Int[np.ndarray, "*S"]) -> UInt[np.ndarray, "*S"]:
     """0, -1, 1, -2 ... -> 0, 1, 2, 3 ...: small magnitudes become small unsigned numbers."""
     return ((signed << 1) ^ (signed >> 31)).astype(np.uint32)
 
 
-def unzigzag(unsigned: Int[np.ndarray, "*S"]) -> Int[np.ndarray, "*S"]:
+def unzigzag(unsigned: UInt[np.ndarray, "*S"]) -> Int[np.ndarray, "*S"]:
     return ((unsigned >> 1) ^ (0 - (unsigned & 1))).astype(np.int32)
 
 

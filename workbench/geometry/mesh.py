@@ -51,9 +51,23 @@ def half_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "H 2"]:
     return torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
+@dataclass(frozen=True)
+class UniquePairs:
+    pairs: Int[Tensor, "E 2"]  # sorted
+    which: Int[Tensor, " H"]  # the unique pair that each given pair is
+    count: Int[Tensor, " E"]
+
+
+def unique_pairs(pairs: Int[Tensor, "H 2"]) -> UniquePairs:
+    """Distinct pairs of indices. One key a pair, because torch.unique(dim=0) is slow."""
+    base = int(pairs.max()) + 1 if len(pairs) else 1
+    keys, which, count = torch.unique(pairs[:, 0] * base + pairs[:, 1], return_inverse=True, return_counts=True)
+    return UniquePairs(torch.stack([keys // base, keys % base], 1), which, count)
+
+
 def unique_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
     """Undirected edges, smaller index first, sorted."""
-    return torch.unique(half_edges(faces).sort(1).values, dim=0)
+    return unique_pairs(half_edges(faces).sort(1).values).pairs
 
 
 def inspect_topology(faces: Int[Tensor, "F 3"], vertex_count: int) -> Topology:
@@ -68,8 +82,9 @@ def inspect_topology(faces: Int[Tensor, "F 3"], vertex_count: int) -> Topology:
     if low < 0 or high >= vertex_count:
         raise ValueError(f"faces index vertex {low if low < 0 else high}, but the mesh has {vertex_count} vertices")
     directed = half_edges(faces)
-    edges, edge_of_half, count = torch.unique(directed.sort(1).values, dim=0, return_inverse=True, return_counts=True)
-    _, times_walked = torch.unique(directed, dim=0, return_counts=True)
+    undirected = unique_pairs(directed.sort(1).values)
+    edges, edge_of_half, count = undirected.pairs, undirected.which, undirected.count
+    times_walked = unique_pairs(directed).count
     used = torch.zeros(vertex_count, dtype=torch.bool)
     used[faces.reshape(-1)] = True
     degenerate = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
@@ -105,7 +120,7 @@ def _pinched_vertices(
     first, second = order[:-1][same], order[1:][same]
     pairs = torch.cat([torch.stack([low[first], low[second]], 1), torch.stack([high[first], high[second]], 1)])
     fan = _components(pairs.numpy(), 3 * count)
-    fans = torch.unique(torch.stack([faces.T.reshape(-1), torch.from_numpy(fan)], 1), dim=0)
+    fans = unique_pairs(torch.stack([faces.T.reshape(-1), torch.from_numpy(fan)], 1)).pairs
     return torch.nonzero(torch.bincount(fans[:, 0], minlength=vertex_count) > 1)[:, 0]
 
 
@@ -116,8 +131,8 @@ def boundary_loops(faces: Int[Tensor, "F 3"]) -> tuple[Int[Tensor, " L"], ...]:
         ValueError: a boundary vertex is where two loops touch (the mesh is pinched there).
     """
     directed = half_edges(faces)
-    _, which, count = torch.unique(directed.sort(1).values, dim=0, return_inverse=True, return_counts=True)
-    border = directed[count[which] == 1].tolist()
+    undirected = unique_pairs(directed.sort(1).values)
+    border = directed[undirected.count[undirected.which] == 1].tolist()
     following = dict(border)
     if len(following) < len(border):
         raise ValueError("two boundary loops touch in one vertex; split that vertex first")
@@ -232,7 +247,8 @@ def subdivide_quads(mesh: QuadMesh) -> QuadMesh:
     """Each quad into four at edge midpoints and centroid (linear: no vertex moves, winding is kept)."""
     vertices, quads = mesh.vertices, mesh.quads
     sides = torch.cat([quads[:, [i, (i + 1) % 4]] for i in range(4)])
-    edges, side_edge = torch.unique(sides.sort(1).values, dim=0, return_inverse=True)
+    unique = unique_pairs(sides.sort(1).values)
+    edges, side_edge = unique.pairs, unique.which
     count = len(vertices)
     middle = (count + side_edge).reshape(4, len(quads)).T  # (Q,4): middle of the side that starts at corner i
     centre = count + len(edges) + torch.arange(len(quads))
@@ -241,7 +257,7 @@ def subdivide_quads(mesh: QuadMesh) -> QuadMesh:
     return QuadMesh(grown, torch.stack(children, 1).reshape(-1, 4))
 
 
-def triangulate(mesh: QuadMesh) -> Int[Tensor, "2*Q 3"]:
+def triangulate(mesh: QuadMesh) -> Int[Tensor, "F 3"]:
     """Each quad cut along its shorter diagonal, winding kept."""
     a, b, c, d = mesh.quads.T
     first = (mesh.vertices[a] - mesh.vertices[c]).norm(dim=1) <= (mesh.vertices[b] - mesh.vertices[d]).norm(dim=1)
