@@ -124,16 +124,16 @@ SHAPES = {"mean": (), "slim": (1.0, -0.5, 0.8), "heavy": (-0.8, 0.5, -1.0)}
 DEFAULT_SET = (
     Planned("tshirt_demo", "tshirt", "dance_00", 90, "mean", ships=True),
     Planned("dress_turn", "dress", "turn_00", 75, "mean", ships=True),
-    Planned("tshirt_reach", "tshirt", "reach_00", 75, "slim", ships=True),
+    Planned("tshirt_reach", "tshirt", "reach_00", 75, "slim"),
     Planned("tshirt_squat", "tshirt", "squat_00", 75, "heavy", ships=True),
     Planned("dress_dance", "dress", "dance_02", 75, "slim", ships=True),
-    Planned("tshirt_punch", "tshirt", "punch_00", 75, "heavy", ships=True),
+    Planned("tshirt_punch", "tshirt", "punch_00", 75, "heavy"),
     Planned("tshirt_walk", "tshirt", "walk_00", 75, "slim", ships=True),
     Planned("dress_kick", "dress", "kick_00", 75, "heavy"),
     Planned("tshirt_jump", "tshirt", "jump_00", 75, "mean"),
-    Planned("tshirt_twist", "tshirt", "twist_00", 75, "heavy"),
+    Planned("tshirt_twist", "tshirt", "twist_00", 75, "heavy", ships=True),
     Planned("dress_twist", "dress", "twist_01", 75, "mean"),
-    Planned("tshirt_excursion", "tshirt", "excursion_00", 75, "slim"),
+    Planned("tshirt_excursion", "tshirt", "excursion_00", 75, "slim", ships=True),
 )
 
 

@@ -21,22 +21,22 @@ class Row:
     holds: bool | None = None
 
 
-def at_most(metric: str, value: float, unit: str, bound: float) -> Row:
+def at_most(metric: str, value: float | int, unit: str, bound: float | int) -> Row:
     """A figure that must not exceed `bound` (same unit); NaN fails."""
     return Row(metric, float(value), unit, f"<= {bound:g}", bool(value <= bound))
 
 
-def at_least(metric: str, value: float, unit: str, bound: float) -> Row:
+def at_least(metric: str, value: float | int, unit: str, bound: float | int) -> Row:
     """A figure that must reach `bound` (same unit); NaN fails."""
     return Row(metric, float(value), unit, f">= {bound:g}", bool(value >= bound))
 
 
-def within(metric: str, value: float, unit: str, low: float, high: float) -> Row:
+def within(metric: str, value: float | int, unit: str, low: float | int, high: float | int) -> Row:
     """A figure that must lie in [low, high] (same unit); NaN fails."""
     return Row(metric, float(value), unit, f"{low:g} .. {high:g}", bool(low <= value <= high))
 
 
-def told(metric: str, value: float, unit: str) -> Row:
+def told(metric: str, value: float | int, unit: str) -> Row:
     """A figure without a bound: a baseline or a detail."""
     return Row(metric, float(value), unit)
 
