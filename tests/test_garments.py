@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 """Laws of workbench.garments: what ships is usable, and every unusable garment gets its one line."""
 
 import numpy as np

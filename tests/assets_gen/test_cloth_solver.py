@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 """Laws of assets_gen.cloth_solver that need no simulation; those that do are in test_simulations."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 """Laws of assets_gen.simulations, on a ball that moves under a cap of cloth."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 """Samples: where they should be, as dense as they should be; normal directions with the right moments."""
 
 import numpy as np

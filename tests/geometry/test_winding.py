@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 """Winding numbers: 0, 1 and 2, agreement of the fast test with the exact sum, a posed body that overlaps itself."""
 
 import numpy as np
