@@ -1,10 +1,13 @@
-"""Sec. 6: which garment vertices are inside the body.  body (T,V,3), garment (T,N,3) -> inside (T,N), overlap (T,N).
+"""Sec. 6: where a garment is inside the body.  body (T,V,3), garment (T,N,3) -> inside (T,N), overlap (T,N); crossings.
 
-A vertex collides where the body's exact winding number exceeds 1/2.  Where it exceeds 3/2 the body overlaps itself, and
-no garment could be free of it: such vertices are counted apart, never left out.
+A vertex collides where the body's exact winding number is 1 or more.  Where it is 2 or more the body overlaps itself,
+and no garment could be free of it: such vertices are counted apart, never left out.  A garment whose vertices are all
+outside can still cross the body between them: `surface_penetration` counts its edges and faces, and the body vertices
+that poke through.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from workbench.geometry.winding import InsideTest, winding_number
+from workbench.geometry.crossings import Crossings, SurfaceCrossing
+from workbench.geometry.layer_count import LayerCount
+from workbench.geometry.mesh import face_areas, face_normals, half_edges, unique_pairs
+from workbench.geometry.signed_distance import SignedDistance
+
+THREADS = 2  # ours: Warp's CPU launches are single-threaded, and beyond two threads the memory is the limit
+FrameWork = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,29 @@ class Penetration:
         return self.inside.sum(dim=1)
 
 
+@dataclass(frozen=True)
+class SurfacePenetration:
+    """Collisions of surfaces, not only of vertices; `.sum(dim=1)` of any of them counts per frame."""
+
+    edges: Int[Tensor, "E 2"]  # the garment's edges, smaller index first
+    inside: Bool[Tensor, "T N"]  # garment vertices inside the body
+    crossing_edges: Bool[Tensor, "T E"]  # garment edges that cross a body face
+    crossing_faces: Bool[Tensor, "T G"]  # garment faces that a body face crosses in any way
+    hidden_edges: Bool[Tensor, "T E"]  # of the edges, those whose ends are both outside: no vertex shows them
+    hidden_faces: Bool[Tensor, "T G"]  # of the faces, those whose corners are all outside
+    poking: Bool[Tensor, "T V"]  # body vertices that stand out through a garment face beside them
+
+    @property
+    def edge_share(self) -> float:
+        """Crossing edges among all edges of all frames, 0..1."""
+        return float(self.crossing_edges.float().mean())
+
+    @property
+    def face_share(self) -> float:
+        """Crossing faces among all faces of all frames, 0..1."""
+        return float(self.crossing_faces.float().mean())
+
+
 def penetration(
     body_vertices: Float[Tensor, "B V 3"],
     body_faces: Int[Tensor, "F 3"],
@@ -49,21 +81,132 @@ def penetration(
     B is T, or 1 where one body serves all garment frames (the constant body of canonical space).
     Errors: ValueError when frame counts differ, positions are not finite, or the body is not closed.
     """
+    check_frames(body_vertices, garment)
+    faces = body_faces.numpy()
+    layers = torch.zeros(garment.shape[:2], dtype=torch.int64)
+
+    def worker() -> FrameWork:
+        count = LayerCount(body_vertices[0].numpy(), faces)
+
+        def work(frame: int) -> None:
+            count.refit(body_of(body_vertices, frame).numpy())
+            layers[frame] = torch.from_numpy(count(garment[frame].numpy()))
+            progress(1)
+
+        return work
+
+    each_frame(len(garment), worker)
+    return Penetration(layers >= 1, layers >= 2)
+
+
+def surface_penetration(
+    body_vertices: Float[Tensor, "B V 3"],
+    body_faces: Int[Tensor, "F 3"],
+    garment: Float[Tensor, "T N 3"],
+    garment_faces: Int[Tensor, "G 3"],
+    progress: Callable[[int], None] = lambda frames: None,
+) -> SurfacePenetration:
+    """Exact test of every garment edge and face against every body face, in every frame.
+
+    B is T or 1, as in `penetration`.  Poking needs to know the garment's outer side: that of its normals, or the other
+    where most of them face the body in the first frame.
+    Errors: as `penetration`'s.
+    """
+    check_frames(body_vertices, garment)
+    faces, sheet_faces = body_faces.numpy(), garment_faces.numpy()
+    outwards = normals_show_outwards(garment[0], garment_faces, body_vertices[0], body_faces)
+    found = SurfaceRecord(len(garment), garment.shape[1], garment_faces, body_vertices.shape[1])
+
+    def worker() -> FrameWork:
+        count = LayerCount(body_vertices[0].numpy(), faces)
+        crossing = SurfaceCrossing(body_vertices[0].numpy(), faces)
+
+        def work(frame: int) -> None:
+            surface, points = body_of(body_vertices, frame).numpy(), garment[frame].numpy()
+            count.refit(surface)
+            crossing.refit(surface)
+            found.write(frame, count(points) >= 1, crossing(points, sheet_faces, outwards=outwards))
+            progress(1)
+
+        return work
+
+    each_frame(len(garment), worker)
+    return found.result()
+
+
+class SurfaceRecord:
+    """Collects the frames of a `SurfacePenetration`; frames may come in any order, from several threads."""
+
+    def __init__(self, frames: int, vertices: int, garment_faces: Int[Tensor, "G 3"], body_vertices: int):
+        unique = unique_pairs(half_edges(garment_faces).sort(1).values)
+        self.garment_faces, self.edges, self.edge_of_half = garment_faces, unique.pairs, unique.which
+        self.inside = torch.zeros(frames, vertices, dtype=torch.bool)
+        self.crossing_edges = torch.zeros(frames, len(self.edges), dtype=torch.bool)
+        self.crossing_faces = torch.zeros(frames, len(garment_faces), dtype=torch.bool)
+        self.poking = torch.zeros(frames, body_vertices, dtype=torch.bool)
+
+    def write(self, frame: int, inside: Bool[np.ndarray, "N"], crossings: Crossings) -> None:
+        of_halves = torch.from_numpy(crossings.edges.T.copy()).reshape(-1)  # all (0,1), then (1,2), then (2,0)
+        self.inside[frame] = torch.from_numpy(inside)
+        self.crossing_edges[frame, self.edge_of_half[of_halves]] = True
+        self.crossing_faces[frame] = torch.from_numpy(crossings.faces)
+        self.poking[frame] = torch.from_numpy(crossings.poking)
+
+    def result(self) -> SurfacePenetration:
+        inside_corner = self.inside[:, self.garment_faces].any(2)
+        inside_end = self.inside[:, self.edges].any(2)
+        return SurfacePenetration(
+            edges=self.edges,
+            inside=self.inside,
+            crossing_edges=self.crossing_edges,
+            crossing_faces=self.crossing_faces,
+            hidden_edges=self.crossing_edges & ~inside_end,
+            hidden_faces=self.crossing_faces & ~inside_corner,
+            poking=self.poking,
+        )
+
+
+def normals_show_outwards(
+    garment: Float[Tensor, "N 3"], garment_faces: Int[Tensor, "G 3"], body: Float[Tensor, "V 3"], body_faces: Tensor
+) -> bool:
+    """Whether most of the garment's area has its normals away from the body."""
+    centres = garment[garment_faces].mean(1)
+    distance, nearest = SignedDistance(body.numpy(), body_faces.numpy()).with_surface_point(centres.numpy())
+    outwards = (centres - torch.from_numpy(nearest.point)) * torch.from_numpy(distance).sign()[:, None]
+    agrees = (face_normals(garment, garment_faces) * outwards).sum(1).sign()
+    return bool((face_areas(garment, garment_faces) * agrees).sum() >= 0)
+
+
+def check_frames(body_vertices: Float[Tensor, "B V 3"], garment: Float[Tensor, "T N 3"]) -> None:
+    """ValueError unless every garment frame has its body and all of it is finite."""
     if len(body_vertices) not in (1, len(garment)):
         raise ValueError(f"{len(body_vertices)} body frames, but {len(garment)} garment frames; cut both to one length")
-    if not bool(torch.isfinite(garment).all()):
-        raise ValueError("the garment holds NaN or infinity; drop the frames where it diverged")
-    faces = body_faces.numpy()
-    test = InsideTest(body_vertices[0].numpy(), faces)
-    inside = torch.zeros(garment.shape[:2], dtype=torch.bool)
-    overlap = torch.zeros_like(inside)
-    for frame, points in enumerate(garment.numpy()):
-        moves = len(body_vertices) > 1
-        surface = body_vertices[frame if moves else 0].numpy()
-        if moves:
-            test.refit(surface)
-        hit = np.flatnonzero(test(points))
-        inside[frame, hit] = True
-        overlap[frame, hit] = torch.from_numpy(winding_number(points[hit], surface, faces) > 1.5)
-        progress(1)
-    return Penetration(inside, overlap)
+    for name, vertices in (("body", body_vertices), ("garment", garment)):
+        if not bool(torch.isfinite(vertices).all()):
+            raise ValueError(f"the {name} holds NaN or infinity; drop the frames where it diverged")
+
+
+def body_of(body_vertices: Float[Tensor, "B V 3"], frame: int) -> Float[Tensor, "V 3"]:
+    """The body of a garment frame: its own, or the one that serves all."""
+    return body_vertices[frame if len(body_vertices) > 1 else 0]
+
+
+def each_frame(frames: int, worker: Callable[[], FrameWork]) -> None:
+    """Every frame once, on as many threads as torch may use, at most two; `worker()` makes what a thread owns."""
+    if frames == 0:
+        return
+    first = worker()
+    first(0)  # compiles the kernels, once, on this thread
+    threads = min(THREADS, torch.get_num_threads(), frames)
+
+    def share(which: int) -> None:
+        work = first if which == 0 else worker()
+        for frame in range(1 + which, frames, threads):
+            work(frame)
+
+    if threads == 1:
+        share(0)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(share, which) for which in range(threads)]:
+            done.result()
