@@ -49,15 +49,25 @@ class Penetration:
 
 @dataclass(frozen=True)
 class SurfacePenetration:
-    """Collisions of surfaces, not only of vertices; `.sum(dim=1)` of any of them counts per frame."""
+    """Collisions of surfaces, not only of vertices; `.sum(dim=1)` of any mask counts per frame."""
 
     edges: Int[Tensor, "E 2"]  # the garment's edges, smaller index first
     inside: Bool[Tensor, "T N"]  # garment vertices inside the body
     crossing_edges: Bool[Tensor, "T E"]  # garment edges that cross a body face
     crossing_faces: Bool[Tensor, "T G"]  # garment faces that a body face crosses in any way
-    hidden_edges: Bool[Tensor, "T E"]  # of the edges, those whose ends are both outside: no vertex shows them
-    hidden_faces: Bool[Tensor, "T G"]  # of the faces, those whose corners are all outside
+    faces: Int[Tensor, "G 3"]
     poking: Bool[Tensor, "T V"]  # body vertices that stand out through a garment face beside them
+
+    @property
+    def hidden_edges(self) -> Bool[Tensor, "T E"]:
+        """Crossing edges whose ends are both outside: no vertex shows them."""
+        return self.crossing_edges & ~(self.inside[:, self.edges[:, 0]] | self.inside[:, self.edges[:, 1]])
+
+    @property
+    def hidden_faces(self) -> Bool[Tensor, "T G"]:
+        """Crossing faces whose corners are all outside."""
+        a, b, c = self.faces.T
+        return self.crossing_faces & ~(self.inside[:, a] | self.inside[:, b] | self.inside[:, c])
 
     @property
     def edge_share(self) -> float:
@@ -153,15 +163,12 @@ class SurfaceRecord:
         self.poking[frame] = torch.from_numpy(crossings.poking)
 
     def result(self) -> SurfacePenetration:
-        inside_corner = self.inside[:, self.garment_faces].any(2)
-        inside_end = self.inside[:, self.edges].any(2)
         return SurfacePenetration(
             edges=self.edges,
             inside=self.inside,
             crossing_edges=self.crossing_edges,
             crossing_faces=self.crossing_faces,
-            hidden_edges=self.crossing_edges & ~inside_end,
-            hidden_faces=self.crossing_faces & ~inside_corner,
+            faces=self.garment_faces,
             poking=self.poking,
         )
 
