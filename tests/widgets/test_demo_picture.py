@@ -48,7 +48,7 @@ def test_three_columns_with_a_row_a_frame(result):
         "canonical, frame 1: 0 inside",
         "another shape, frame 1: 42 inside",
     ]
-    for view in scene.views:
+    for view in scene.at(0).views:
         assert isinstance(view.layers[-1], Points) == view.title.startswith("another")
         for layer in view.layers:
             if isinstance(layer, Mesh):

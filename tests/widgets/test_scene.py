@@ -59,12 +59,13 @@ def test_given_camera_is_kept():
 def test_colliding_vertices_are_drawn_on_top(rng):
     body, garment = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
     inside = np.array([True, False, True])
-    view = dressed(body, FACES, garment, FACES, inside)
-    top = view.layers[-1]
+    scene = Scene((dressed(body, FACES, garment, FACES, inside),))
+    top = scene.at(0).views[0].layers[-1]
     assert isinstance(top, Points)
     assert top.on_top
     np.testing.assert_array_equal(top.positions, garment[inside])
-    assert len(dressed(body, FACES, garment, FACES, np.zeros(3, bool)).layers) == 2
+    clean = Scene((dressed(body, FACES, garment, FACES, np.zeros(3, bool)),))
+    assert len(clean.at(0).views[0].layers) == 2
 
 
 def test_ghost_keeps_all_but_the_surfaces(rng):
