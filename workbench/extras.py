@@ -6,6 +6,7 @@ from types import ModuleType
 # What each extra of pyproject.toml is for, by the modules that stand for it.
 EXTRAS = {
     "assets": ("newton", "anny", "dask", "distributed", "networkx"),
+    "meshing": ("open3d",),
     "lab": ("jupyterlab", "ipywidgets", "anywidget", "matplotlib"),
     "test": ("pytest", "xdist", "hypothesis", "beartype", "nbmake"),
 }
