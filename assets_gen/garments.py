@@ -1,8 +1,9 @@
 """Sec. 4.3's templates: MakeHuman's CC0 tights -> cut, hemmed, loosened, draped.  -> workbench/assets/garments/*.npz
 
-Cut: quads of the helper mesh above the hem line, up to the sleeve and below the neckline; the lower border is extruded
-to the hem (with flare: a skirt); every quad is split in four; smoothing against the wanted gap to the body gives the
-material's rest shape. Drape: that shape falls onto the mean body until it rests.
+Cut: quads of the helper mesh above the hem line, up to the sleeve and below the neckline, or from the waist down; the
+lower border (of trousers, both) is extruded to the hem (with flare: a skirt); every quad is split in four; smoothing
+against the wanted gap to the body gives the material's rest shape. Drape: that shape falls onto the mean body until it
+rests.
 """
 
 import logging
@@ -40,6 +41,7 @@ ARMPIT_REACH = 0.08  # metres from the armpit's middle to where the sheet leaves
 UNDERARM = 0.1  # metres around the armpits where the sheet may slide freely, lest it fold
 SLIDE = 0.2  # elsewhere: of the smoothing within the sheet; 1 across it
 SHORT_EDGE = 0.006  # metres; the solver's self-contact (3 mm thick) must not see neighbours
+BELT = 0.05  # metres of a waistband that are drawn in
 RING = 0.026  # metres between extruded rings, before the subdivision halves it: the size of the helper's own quads
 
 
@@ -61,8 +63,24 @@ class Outfit:
     smoothing: int = 60  # steps
 
 
-# ours: drapes compared in pictures. Another upper-body garment is one more line, e.g. a tank top is sleeve=0.05.
-OUTFITS = {
+@dataclass(frozen=True)
+class LowerOutfit:
+    """How one lower-body garment is cut. Lengths in metres, heights above the hip joint."""
+
+    name: str
+    top: float  # height of the waistband
+    cut: float  # where the tights end and the extrusion begins: on the hip for a skirt, below the crotch for legs
+    hem: float
+    flare: float  # the hem is 1 + flare times as wide as the cut; negative: legs that narrow
+    legs: int  # 2; a skirt has 1
+    belt: float = 0.08  # share of the waist by which its material is shorter: it holds the garment
+    gap_waist: float = 0.005  # wanted distance to the body at the waistband ...
+    gap_leg: float = 0.012  # ... and from the hip joint down
+    smoothing: int = 60  # steps
+
+
+# ours: drapes compared in pictures.
+OUTFITS: dict[str, Outfit | LowerOutfit] = {
     "tshirt": Outfit(
         "tshirt",
         sleeve=0.70,
@@ -85,6 +103,33 @@ OUTFITS = {
         armhole=0.038,
         gap_belly=0.012,
     ),
+    "longsleeve": Outfit(
+        "longsleeve",
+        sleeve=1.66,
+        neck_height=-0.004,
+        neck_tilt=0.36,
+        cut=0.12,
+        hem=-0.04,
+        flare=0.10,
+        armhole=0.042,
+        gap_belly=0.030,
+        gap_sleeve=0.016,
+    ),
+    "tank": Outfit(
+        "tank",
+        sleeve=-0.06,
+        neck_height=-0.012,
+        neck_tilt=0.58,
+        cut=0.12,
+        hem=0.0,
+        flare=0.06,
+        armhole=0.03,
+        gap_belly=0.030,
+        gap_sleeve=0.006,
+    ),
+    "trousers": LowerOutfit("trousers", top=0.15, cut=-0.16, hem=-0.74, flare=-0.28, legs=2),
+    "shorts": LowerOutfit("shorts", top=0.15, cut=-0.16, hem=-0.30, flare=0.08, legs=2),
+    "skirt": LowerOutfit("skirt", top=0.16, cut=0.06, hem=-0.38, flare=0.55, legs=1),
 }
 
 
@@ -143,7 +188,7 @@ def run(config: GarmentsConfig) -> tuple[Garment, ...]:
 def drape(cut: "CutGarment", body: Body, config: DrapeConfig = DrapeConfig()) -> Float[np.ndarray, "N 3"]:
     """Where the cut garment comes to rest on the canonical body.  Raises ValueError if it does not."""
     still = body.template.numpy()
-    solver = ClothSolver(still, body.faces.numpy(), cut.vertices, cut.faces, config=config.cloth)
+    solver = ClothSolver(still, body.faces.numpy(), cut.vertices, cut.faces, cut.put_on, config.cloth)
     speed = np.inf
     for _ in range(config.frames):
         before = solver.positions
@@ -158,27 +203,30 @@ def drape(cut: "CutGarment", body: Body, config: DrapeConfig = DrapeConfig()) ->
 
 @dataclass(frozen=True)
 class CutGarment:
-    """The material's rest shape: outside of the body everywhere, stress-free by definition."""
+    """The material's rest shape, stress-free by definition, and where it is put on: outside of the body everywhere."""
 
     vertices: Float[np.ndarray, "N 3"]
+    put_on: Float[np.ndarray, "N 3"]  # the rest shape itself, but for a waistband that is tighter than the waist
     faces: Int[np.ndarray, "F 3"]
 
 
 def cut_garment(
-    outfit: Outfit, body: Body, helpers: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]
+    outfit: Outfit | LowerOutfit, body: Body, helpers: Float[np.ndarray, "H 3"], quads: Int[np.ndarray, "Q 4"]
 ) -> CutGarment:
     """One manifold sheet outside of the canonical body.
 
     helpers: vertices of MakeHuman's full mesh in the canonical rest; quads: the tights' faces among them.
     """
-    landmarks = Landmarks.of(body)
-    vertices, faces = _largest_part(helpers, quads[_smooth_selection(_keep(outfit, landmarks), helpers, quads)])
-    vertices, faces = _extrude(vertices, faces, outfit, landmarks)
+    at = Landmarks.of(body)
+    pattern = _upper_pattern(outfit, at) if isinstance(outfit, Outfit) else _lower_pattern(outfit, at)
+    vertices, faces = _largest_part(helpers, quads[_smooth_selection(pattern.keep, helpers, quads)])
+    vertices, faces = _extrude(vertices, faces, outfit, pattern.legs, at)
     fine = subdivide_quads(QuadMesh(torch.from_numpy(vertices), torch.from_numpy(faces)))
-    relaxed = _relax(fine.vertices.numpy(), fine.quads.numpy(), body, outfit, landmarks)
+    relaxed = _relax(fine.vertices.numpy(), fine.quads.numpy(), body, pattern, at)
     triangles = triangulate(QuadMesh(torch.from_numpy(relaxed), fine.quads))
     require_sheet(torch.from_numpy(relaxed), triangles, outfit.name)
-    return CutGarment(relaxed, triangles.numpy())
+    material = relaxed if isinstance(outfit, Outfit) else _belted(relaxed, outfit, at)
+    return CutGarment(material, relaxed, triangles.numpy())
 
 
 @dataclass(frozen=True)
@@ -190,11 +238,19 @@ class Landmarks:
     neck: Float[np.ndarray, "3"]
     waist: Float[np.ndarray, "3"]
     hip: Float[np.ndarray, "3"]
+    knee: Float[np.ndarray, "3"]
+    foot: Float[np.ndarray, "3"]
 
     @staticmethod
     def of(body: Body) -> "Landmarks":
         at = dict(zip(body.skeleton.names, body.skeleton.rest_joints.double().numpy(), strict=True))
-        return Landmarks(at["LeftArm"], at["LeftForeArm"], at["Neck"], at["LowerBack"], at["LeftUpLeg"])
+        names = ("LeftArm", "LeftForeArm", "Neck", "LowerBack", "LeftUpLeg", "LeftLeg", "LeftFoot")
+        return Landmarks(*(at[name] for name in names))
+
+    def leg_axis(self, height: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P 2"]:
+        """x and y of the left leg's bones at these heights."""
+        joints = np.stack([self.foot, self.knee, self.hip])
+        return np.stack([np.interp(height, joints[:, 2], joints[:, axis]) for axis in (0, 1)], 1)
 
     def along_arm(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         """0 at the shoulder joint, 1 at the elbow; both arms."""
@@ -202,6 +258,59 @@ class Landmarks:
         mirrored[:, 0] = np.abs(mirrored[:, 0])
         arm = self.elbow - self.shoulder
         return (mirrored - self.shoulder) @ arm / (arm @ arm)
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """What cutting and smoothing ask of an outfit: which quads it has, where its borders lie, how far off the body."""
+
+    keep: Callable[[np.ndarray], np.ndarray]
+    onto_cut: Callable[[np.ndarray], np.ndarray]
+    gap: Callable[[np.ndarray], np.ndarray]
+    least_gap: float
+    armhole: float
+    legs: int  # lower borders that are extruded
+    smoothing: int
+
+
+def _upper_pattern(outfit: Outfit, at: Landmarks) -> _Pattern:
+    return _Pattern(
+        keep=_keep(outfit, at),
+        onto_cut=_onto_cut(outfit, at),
+        gap=_wanted_gap(outfit, at),
+        least_gap=outfit.gap_shoulder,
+        armhole=outfit.armhole,
+        legs=1,
+        smoothing=outfit.smoothing,
+    )
+
+
+def _lower_pattern(outfit: LowerOutfit, at: Landmarks) -> _Pattern:
+    top, cut, hem = (at.hip[2] + height for height in (outfit.top, outfit.cut, outfit.hem))
+
+    def keep(centres: Float[np.ndarray, "Q 3"]) -> Bool[np.ndarray, "Q"]:
+        # hands hang as low as the hips, but wider than any leg
+        return (centres[:, 2] < top) & (centres[:, 2] > cut) & (np.abs(centres[:, 0]) < 2.5 * at.hip[0])
+
+    def onto_cut(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        nearer_top = np.abs(points[:, 2] - top) < np.abs(points[:, 2] - hem)
+        return np.column_stack([points[:, :2], np.where(nearer_top, top, hem)])
+
+    def gap(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        down = np.clip((top - points[:, 2]) / (top - at.hip[2]), 0, 1)
+        return outfit.gap_waist + (outfit.gap_leg - outfit.gap_waist) * down
+
+    return _Pattern(keep, onto_cut, gap, outfit.gap_waist, 0.0, outfit.legs, outfit.smoothing)
+
+
+def _belted(vertices: np.ndarray, outfit: LowerOutfit, at: Landmarks) -> np.ndarray:
+    """The material's waistband is drawn in towards its middle, less so further down."""
+    share = np.clip((vertices[:, 2] - at.hip[2] - outfit.top) / BELT + 1, 0, 1)
+    band = vertices[share > 0]
+    middle = (band.min(0) + band.max(0)) / 2
+    drawn = vertices.copy()
+    drawn[:, :2] -= outfit.belt * share[:, None] * (vertices[:, :2] - middle[:2])
+    return drawn
 
 
 def _keep(outfit: Outfit, at: Landmarks) -> Callable[[np.ndarray], np.ndarray]:
@@ -281,44 +390,49 @@ def _labels(pairs: np.ndarray, count: int) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _extrude(vertices: np.ndarray, quads: np.ndarray, outfit: Outfit, at: Landmarks) -> tuple[np.ndarray, np.ndarray]:
-    """Rings of quads from the lowest boundary loop down to the hem, widening by the flare."""
+def _extrude(
+    vertices: np.ndarray, quads: np.ndarray, outfit: Outfit | LowerOutfit, legs: int, at: Landmarks
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rings of quads from the lowest boundary loops down to the hem, widening by the flare, along the legs if two."""
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     loops = [loop.numpy() for loop in boundary_loops(torch.from_numpy(triangles))]
-    loop = min(loops, key=lambda chain: vertices[chain, 2].mean())
-    top = vertices[loop]
-    centre = (top.min(0) + top.max(0)) / 2
     hem = at.hip[2] + outfit.hem
-    rings = max(1, round((top[:, 2].mean() - hem) / RING))
-    all_vertices, all_quads, above = [vertices], [quads], loop
-    for ring in range(1, rings + 1):
-        t = ring / rings
-        points = top.copy()
-        points[:, :2] = centre[:2] + (top - centre)[:, :2] * (1 + outfit.flare * t)
-        points[:, 2] += (hem - top[:, 2]) * t
-        below = len(vertices) + (ring - 1) * len(loop) + np.arange(len(loop))
-        # The faces above walk their border along the loop; the new ones must walk it backwards.
-        all_quads.append(np.stack([np.roll(above, -1), above, below, np.roll(below, -1)], 1))
-        all_vertices.append(points)
-        above = below
+    all_vertices, all_quads, count = [vertices], [quads], len(vertices)
+    for loop in sorted(loops, key=lambda chain: vertices[chain, 2].mean())[:legs]:
+        top = vertices[loop]
+        centre = (top.min(0) + top.max(0)) / 2
+        rings, above = max(1, round((top[:, 2].mean() - hem) / RING)), loop
+        for ring in range(1, rings + 1):
+            t = ring / rings
+            points = top.copy()
+            points[:, :2] = centre[:2] + (top - centre)[:, :2] * (1 + outfit.flare * t)
+            points[:, 2] += (hem - top[:, 2]) * t
+            if legs == 2:
+                aside = at.leg_axis(points[:, 2]) - at.leg_axis(top[:, 2])
+                points[:, :2] += aside * [np.sign(centre[0]), 1]
+            below = count + np.arange(len(loop))
+            # The faces above walk their border along the loop; the new ones must walk it backwards.
+            all_quads.append(np.stack([np.roll(above, -1), above, below, np.roll(below, -1)], 1))
+            all_vertices.append(points)
+            above, count = below, count + len(loop)
     return np.concatenate(all_vertices), np.concatenate(all_quads)
 
 
-def _relax(vertices: np.ndarray, quads: np.ndarray, body: Body, outfit: Outfit, at: Landmarks) -> np.ndarray:
+def _relax(vertices: np.ndarray, quads: np.ndarray, body: Body, pattern: _Pattern, at: Landmarks) -> np.ndarray:
     """Smooth, and push whatever is closer to the body than wanted out to the wanted gap; ends with a push.
 
     Down to the thighs smoothing pulls the sheet taut over the body; below, Taubin's alternating signs keep the flare.
     Boundary vertices average along the boundary only and stay in the plane of their cut.
     """
     inner, border, on_border = _averages(quads, len(vertices))
-    gap, onto_cut = _wanted_gap(outfit, at), _onto_cut(outfit, at)
+    gap, onto_cut = pattern.gap, pattern.onto_cut
     triangles = torch.from_numpy(np.concatenate([quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]))
     sides = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
     edges = np.unique(np.sort(sides, axis=1), axis=0)
     surface = body.template.double().numpy()
     closest, inside = ClosestPoint(surface, body.faces.numpy()), InsideTest(surface, body.faces.numpy())
     armpit = _armpit(at, inside)
-    for step in range(outfit.smoothing):
+    for step in range(pattern.smoothing):
         skirt = vertices[:, 2] < at.hip[2] - BUTTOCKS
         strength = np.where(skirt & (step % 2 == 1), -0.53, 0.5)[:, None]
         sheet = inner @ vertices - vertices
@@ -334,8 +448,8 @@ def _relax(vertices: np.ndarray, quads: np.ndarray, body: Body, outfit: Outfit, 
         push = _push_out(vertices, gap(vertices), closest, inside) - vertices
         # In a crease neighbours are pushed to and fro between its two sides; their mean leads out of it.
         vertices = vertices + (push + inner @ push) / 2
-        vertices = _below_armpits(vertices, armpit, outfit.armhole)
-        vertices = _push_out(vertices, np.full(len(vertices), outfit.gap_shoulder), closest, inside)
+        vertices = _below_armpits(vertices, armpit, pattern.armhole)
+        vertices = _push_out(vertices, np.full(len(vertices), pattern.least_gap), closest, inside)
     return vertices
 
 

@@ -17,6 +17,21 @@ The map
 | penetration         | 4.3, 6  |      | workbench.collisions.penetration | mesh, body -> vertices inside, depth |
 | demo                |         |      | workbench.demo                   | simulated -> canonical -> re-posed   |
 
+Paper 2: Ma, Yang, Tang, Black, "The Power of Points for Modeling Humans in Clothing" (POP), ICCV 2021.
+| stage               | section | eq.  | module                             | in -> out                          |
+|---------------------|---------|------|------------------------------------|------------------------------------|
+| scans               | 4       |      | workbench.points.scans             | file -> points, normals (T,N,3)    |
+| UV position map     | 3.1-3.2 | 2    | workbench.points.uv_position_map   | theta, beta -> I, u_i, p_i, T_i    |
+| pose encoder        | 3.2     |      | workbench.points.pose_encoder      | I (B,3,H,W) -> P (B,64,H,W)        |
+| geometry features   | 3.2     |      | workbench.points.geometry_features | outfit -> G (64,H,W)               |
+| shape decoder       | 3.1     | 1    | workbench.points.shape_decoder     | u_i, z_P, z_G -> r_i, n_i          |
+| clothed points      | 3.1     | 2    | workbench.points.clothed_points    | T_i, r_i, p_i -> x_i, n(x_i)       |
+| losses, training    | 3.3     | 3-6  | workbench.points.losses, training  | scans -> networks, G               |
+| scan fitting        | 3.3     | 7    | workbench.points.scan_fitting      | scan -> G                          |
+| dressing            | 3.3     |      | workbench.points.dressing          | G, motion -> points (T,N,3)        |
+| meshing             | 3.3     |      | workbench.points.meshing           | points, normals -> mesh            |
+| patches (baseline)  | 3.1, 4  |      | workbench.points.patches           | I -> points (N k,3)                |
+
 Notation (declared once, here)
 | symbol        | shape       | meaning                                                            |
 |---------------|-------------|--------------------------------------------------------------------|
@@ -28,7 +43,9 @@ Notation (declared once, here)
 | W~, B~s, B~p  | (N,J) ...   | the same, diffused to any point of space                           |
 | gamma         | (42)        | motion descriptor                                                  |
 | x_bar         | (25)        | latent garment;  E, D  its encoder and decoder                     |
-| T_i           | (3,3)       | local transform;  n  normal;  r  displacement                      |
+| I             | (3,H,W)     | position map of the posed neutral body;  u_i  a point on the UV square |
+| P, G          | (64,H,W)    | pose features, geometry features;  z_P, z_G  read at a point       |
+| p_i, T_i      | (3) (3,3)   | point of the posed body, local transform;  r_i  displacement, n_i  normal |
 Axes: B batch, T frames, V body vertices, N garment vertices or points, F faces, J joints, K shape components.
 Metres, radians, seconds; z up, the body faces -y, its left is +x; float32 unless said.
 Canonical body: beta = 0, theta = 0, straight-arm A45 rest, soles at z = 0.

@@ -71,6 +71,10 @@ class PointModel(nn.Module):
         self.geometry = GeometryFeatures(outfits, config.geometry, generator=generator)
         self.decoder = ShapeDecoder(config.decoder, generator=generator)
 
+    def penalised(self) -> Float[Tensor, "C c H W"]:
+        """G of every outfit, for Eq. 6."""
+        return self.geometry.tensors
+
     def forward(
         self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
     ) -> ClothedPoints:
@@ -82,4 +86,11 @@ class PointModel(nn.Module):
     ) -> ClothedPoints:
         """The same with smoothed geometry features that are given (of a scan that was fitted, Eq. 7)."""
         pose = self.encoder(position_map)
-        return clothed(posed, self.decoder(decoder_inputs(posed.u, pose, geometry)))
+        return clothed(posed, self.decode(posed.u, pose, geometry))
+
+    def decode(
+        self, u: Float[Tensor, "N 2"], pose: Float[Tensor, "B c H W"], geometry: Float[Tensor, "B d h w"]
+    ) -> CanonicalClothes:
+        """The canonical clothes at u, in single precision whatever the networks' is."""
+        canonical = self.decoder(decoder_inputs(u, pose.float(), geometry.float()))
+        return CanonicalClothes(canonical.displacement.float(), canonical.normal.float())

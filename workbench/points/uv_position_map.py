@@ -77,6 +77,11 @@ def atlas_of(body: Body, size: int) -> Atlas:
     return Atlas(size, torch.from_numpy(raster.pixel), queries)
 
 
+def pixel_grid(size: int) -> Float[Tensor, "N 2"]:
+    """u of every pixel of an n x n map, row by row, whether it shows the body or not."""
+    return torch.from_numpy(pixel_centres(np.arange(size * size), size)).float()
+
+
 def scattered_queries(body: Body, count: int, generator: np.random.Generator) -> SurfaceQueries:
     """Any number of points, uniform by area on the body at rest: clothes at any density.
 

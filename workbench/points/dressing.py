@@ -1,0 +1,72 @@
+"""The run time of Sec. 3.3: one outfit on any pose.  theta (T,J,3,3), beta -> clothed points (T,N,3) in the world."""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from workbench.body.model import Body
+from workbench.motion import Motion
+from workbench.points.clothed_points import ClothedPoints, PointModel, clothed
+from workbench.points.fast_decoder import FastDecoder
+from workbench.points.scans import ScanFrame
+from workbench.points.shape_decoder import CanonicalClothes, read_features
+from workbench.points.training import Precision, autocast
+from workbench.points.uv_position_map import (
+    INPUT_SIZE,
+    QUERY_SIZE,
+    PosedBodies,
+    SurfaceQueries,
+    atlas_of,
+    pelvis_frame,
+    posed_bodies,
+    posed_queries,
+)
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+class Dresser:
+    """A trained model bound to one outfit and to the places that are asked for: what does not change is done once."""
+
+    def __init__(
+        self,
+        model: PointModel,
+        geometry: Float[Tensor, "1 d h w"],
+        body: Body,
+        *,
+        queries: SurfaceQueries | None = None,
+        input_size: int = INPUT_SIZE,
+        query_size: int = QUERY_SIZE,
+        precision: Precision = "bfloat16",
+    ):
+        """geometry: smoothed features (`model.geometry(outfit)`, or `scan_fitting.features_of`); queries: where clothes
+        are asked for (default: every pixel of the query map that shows the body)."""
+        self.model, self.body = model.eval(), body
+        self.precision: Precision = precision
+        self.queries = atlas_of(body, query_size).queries if queries is None else queries
+        self._atlas = atlas_of(body, input_size)
+        self._decoder = FastDecoder(model.decoder, model.config.encoder.features, DTYPES[precision])
+        with torch.no_grad():
+            self._share = self._decoder.share(self.queries.u, read_features(geometry, self.queries.u)[0])
+
+    @torch.no_grad()
+    def __call__(self, bodies: PosedBodies) -> ClothedPoints:
+        """Clothes on bodies in the pelvis frame, frame by frame."""
+        image = self._atlas.map_of(bodies.neutral)
+        with autocast(self.precision):
+            pose = self.model.encoder(image).float()
+        read = read_features(pose, self.queries.u)
+        frames = [self._decoder(z_P, self._share) for z_P in read]
+        canonical = CanonicalClothes(
+            torch.stack([frame.displacement for frame in frames]), torch.stack([frame.normal for frame in frames])
+        )
+        return clothed(posed_queries(self.queries, bodies), canonical)
+
+    def animate(self, motion: Motion, betas: Float[Tensor, " K"]) -> Iterator[ScanFrame]:
+        """Points and normals in the world, one frame of the motion after another."""
+        for rotations, translation in zip(motion.rotations, motion.translation, strict=True):
+            cloud = self(posed_bodies(self.body, rotations[None], betas))
+            frame = pelvis_frame(self.body, rotations, betas, translation)
+            yield ScanFrame(frame.to_world(cloud.points[0]), cloud.normals[0] @ frame.rotation.mT)

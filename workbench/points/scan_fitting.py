@@ -1,0 +1,180 @@
+"""Eq. 7: a scan nobody trained on -> its G.  scan Y (N,3) with its body -> G (1,64,H,W), all networks fixed.
+
+The pose does not change during a fit, so P is computed once; only G moves, and a step decodes random pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from workbench.body.model import Body
+from workbench.geometry.chamfer import NearestPoint, match
+from workbench.geometry.closest_point import ClosestPoint
+from workbench.learning.fit import FitConfig, FitResult, fit
+from workbench.npz import read_npz
+from workbench.points.clothed_points import PointModel, clothed
+from workbench.points.losses import (
+    LossTerms,
+    LossWeights,
+    displacement_loss,
+    distance_loss,
+    geometry_loss,
+    normal_loss,
+)
+from workbench.points.scans import ScanFrame
+from workbench.points.training import Precision, autocast, thin
+from workbench.points.uv_position_map import (
+    INPUT_SIZE,
+    QUERY_SIZE,
+    PosedBodies,
+    SurfaceQueries,
+    atlas_of,
+    posed_queries,
+)
+from workbench.store import atomic_write
+
+FARTHEST = 0.08  # metres that the body's surface may lie off the scan, at the median, before it is called misaligned
+FORMAT = "fitted-outfit-1"
+
+
+@dataclass(frozen=True)
+class ScanFitConfig:
+    """How one scan is fitted."""
+
+    fit: FitConfig = FitConfig(
+        steps=200, learning_rate=4e-3, last_rate=2e-4, warmup=5, clip_norm=1e9, checkpoint_every=10**9
+    )  # ours: facts.md 2 has 401 steps of 5e-4; larger and falling rates reach the same loss sooner
+    weights: LossWeights = LossWeights()
+    queries: int = 6000  # pixels a step
+    scan_points: int = 12000  # of the scan a step
+    precision: Precision = "float32"
+    input_size: int = INPUT_SIZE
+    query_size: int = QUERY_SIZE
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FittedOutfit:
+    """What a scan wears: G, and the loss of Eq. 3 over all of the scan before and after."""
+
+    name: str
+    G: Float[Tensor, "1 c H W"]
+    loss_before: float
+    loss_after: float
+
+    def save(self, path: str | Path) -> None:
+        """Own npz; G as float16."""
+        with atomic_write(path) as part:
+            np.savez_compressed(
+                part,
+                format=np.array(FORMAT),
+                name=np.array(self.name),
+                G=self.G.numpy().astype(np.float16),
+                losses=np.array([self.loss_before, self.loss_after]),
+            )
+
+    @staticmethod
+    def load(path: str | Path) -> "FittedOutfit":
+        """Raises FileNotFoundError, or ValueError for another file."""
+        arrays = read_npz(path, "a fitted outfit", required=("format", "name", "G", "losses"))
+        if str(arrays["format"]) != FORMAT:
+            raise ValueError(f"{path} has format {str(arrays['format'])!r}; expected {FORMAT!r}")
+        before, after = (float(loss) for loss in arrays["losses"])
+        return FittedOutfit(str(arrays["name"]), torch.from_numpy(arrays["G"]).float(), before, after)
+
+
+def fit_scan(
+    model: PointModel,
+    body: Body,
+    scan: ScanFrame,
+    bodies: PosedBodies,
+    config: ScanFitConfig = ScanFitConfig(),
+    *,
+    name: str = "scan",
+    watch: Callable[[int, float], None] | None = None,
+) -> tuple[FittedOutfit, FitResult]:
+    """argmin_G L_total(Y)      (Eq. 7), from the mean of the trained G.
+
+    scan, bodies: one frame in the pelvis frame; the model is in evaluation mode and is not changed.
+    Raises ValueError where the body does not lie in the scan.
+    """
+    require_aligned(scan, bodies)
+    places = atlas_of(body, config.query_size).queries
+    image = atlas_of(body, config.input_size).map_of(bodies.neutral)
+    model.eval().requires_grad_(False)
+    try:
+        with torch.no_grad(), autocast(config.precision):
+            pose = model.encoder(image).float()
+        G = model.geometry.mean()[None].clone().requires_grad_()
+
+        def terms_at(asked: SurfaceQueries, seen: ScanFrame) -> LossTerms:
+            posed = posed_queries(asked, bodies)
+            with autocast(config.precision):
+                canonical = model.decode(asked.u, pose, model.geometry.smooth(G))
+            cloud = clothed(posed, canonical)
+            x, n_x = cloud.points[0], cloud.normals[0]
+            matches = match(x, seen.points)
+            return LossTerms(
+                distance=distance_loss(x, seen.points, matches),
+                normal=normal_loss(n_x, seen.normals, matches),
+                displacement=displacement_loss(cloud.displacement),
+                geometry=geometry_loss(G),
+            )
+
+        def loss_of(step: int, generator: torch.Generator) -> Tensor:
+            asked = places.subset(torch.randperm(len(places), generator=generator)[: config.queries])
+            return terms_at(asked, thin(scan, config.scan_points, generator)).total(config.weights)
+
+        def whole_loss() -> float:
+            with torch.no_grad():
+                return terms_at(places, scan).total(config.weights).item()
+
+        before = whole_loss()
+        generator = torch.Generator().manual_seed(config.seed)
+        result = fit([G], loss_of, config.fit, generator=generator, label=f"fit {name}", watch=watch)
+        return FittedOutfit(name, G.detach(), before, whole_loss()), result
+    finally:
+        model.requires_grad_(True)
+
+
+def require_aligned(scan: ScanFrame, bodies: PosedBodies) -> None:
+    """Raises ValueError unless most of the body lies near the scan: points cannot tell a body from its clothes."""
+    if len(bodies) != 1:
+        raise ValueError(f"a scan has one body, got {len(bodies)}")
+    surface = bodies.vertices[0].numpy()
+    nearest = scan.points[torch.from_numpy(NearestPoint(scan.points.numpy())(surface))]
+    off = float((bodies.vertices[0] - nearest).norm(dim=1).median())
+    if off > FARTHEST:
+        raise ValueError(
+            f"the body lies {100 * off:.0f} cm off the scan (median; expected at most {100 * FARTHEST:.0f} cm): "
+            "give the pose, shape and place of the body in this scan"
+        )
+
+
+def features_of(model: PointModel, fitted: FittedOutfit) -> Float[Tensor, "1 c H W"]:
+    """The smoothed features of a fitted outfit: what `PointModel.dress` reads."""
+    with torch.no_grad():
+        return model.geometry.smooth(fitted.G)
+
+
+def lbs_of_scan(scan: ScanFrame, body: Body, worn: PosedBodies, posed: PosedBodies) -> ScanFrame:
+    """Fig. 5's baseline: every scan point is tied to its closest body point and moves rigidly with it.
+
+    worn: the body in the scan; posed: the same body in another pose (one frame each).
+    """
+    surface = ClosestPoint(worn.vertices[0].numpy(), body.faces.numpy()).query(scan.points.numpy())
+    tied = SurfaceQueries(
+        u=torch.zeros(len(scan.points), 2),
+        corners=body.faces[torch.from_numpy(surface.face)],
+        barycentric=torch.from_numpy(surface.barycentric),
+    )
+    before, after = posed_queries(tied, worn), posed_queries(tied, posed)
+    turn = after.transforms[0] @ torch.linalg.inv(before.transforms[0])
+    points = (turn @ (scan.points - before.points[0])[..., None])[..., 0] + after.points[0]
+    normals = torch.nn.functional.normalize((turn @ scan.normals[..., None])[..., 0], dim=-1)
+    return ScanFrame(points, normals)

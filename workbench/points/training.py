@@ -1,0 +1,325 @@
+"""Sec. 3.3: training on scans.  scans (T,N,3) of C outfits -> encoder, decoder and G of every outfit; Eq. 3-6.
+
+A step sees a few frames, a random subset of the pixels that show the body, and a random subset of each scan.  Ours,
+where the published training decodes every pixel of the map: the loss is a mean over points, so a subset is an unbiased
+look at all of its terms but the scan's distance to the cloud, which a sparser cloud overestimates alike everywhere.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from workbench.body.model import Body
+from workbench.geometry.chamfer import match
+from workbench.learning.fit import FitConfig, FitResult, fit
+from workbench.points.clothed_points import ClothedPoints, PointModel, PointModelConfig
+from workbench.points.geometry_features import GeometryFeaturesConfig
+from workbench.points.losses import (
+    LossTerms,
+    LossWeights,
+    displacement_loss,
+    distance_loss,
+    geometry_loss,
+    normal_loss,
+)
+from workbench.points.pose_encoder import PoseEncoderConfig
+from workbench.points.scans import ScanFrame, ScanSequence, outfits_of
+from workbench.points.shape_decoder import ShapeDecoderConfig
+from workbench.points.uv_position_map import (
+    INPUT_SIZE,
+    QUERY_SIZE,
+    Atlas,
+    PosedBodies,
+    PosedQueries,
+    SurfaceQueries,
+    atlas_fingerprint,
+    atlas_of,
+    posed_bodies,
+    posed_queries,
+)
+from workbench.store import atomic_write
+
+Precision = Literal["float32", "bfloat16"]
+KIND = "points-1"  # of the file a trained model is stored in
+
+
+@runtime_checkable
+class ClothesModel(Protocol):
+    """What can be trained on scans: POP, and the patches it is compared with."""
+
+    def __call__(
+        self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
+    ) -> ClothedPoints: ...
+
+    def parameters(self) -> Iterator[nn.Parameter]: ...
+
+    def modules(self) -> Iterator[nn.Module]: ...
+
+    def penalised(self) -> Float[Tensor, "C c H W"]:
+        """G of Eq. 6."""
+        ...
+
+
+@dataclass(frozen=True)
+class PointTrainingConfig:
+    """Ours for two cores by default; `papers_training()` is the paper's."""
+
+    model: PointModelConfig = PointModelConfig(
+        encoder=PoseEncoderConfig(width=16, features=32),
+        geometry=GeometryFeaturesConfig(size=64, features=32),
+        decoder=ShapeDecoderConfig(width=128, features=64),
+    )
+    fit: FitConfig = FitConfig(
+        steps=6000, learning_rate=1e-3, last_rate=1e-5, warmup=100, clip_norm=100.0, checkpoint_every=200
+    )
+    weights: LossWeights = LossWeights()
+    batch: int = 4  # frames a step; facts.md 2
+    queries: int = 4096  # pixels a frame; at most all that show the body
+    scan_points: int = 8192  # of each scan
+    normals_from: float = 0.3  # of the run, when the normal term joins; ours (published: 250 of 401 epochs)
+    normals_before: float = 1e-6  # its weight until then, in units of lambda_n; facts.md 2
+    precision: Precision = "bfloat16"  # of the networks; the losses are taken in float32
+    input_size: int = INPUT_SIZE
+    query_size: int = QUERY_SIZE
+    calibration: int = 16  # batches over which the means and variances of BatchNorm are taken at the end
+    seed: int = 0
+
+
+def papers_training(frames: int) -> PointTrainingConfig:
+    """401 epochs of all pixels in float32 (facts.md 2); `frames` of the training set set the number of steps."""
+    steps = 401 * max(1, math.ceil(frames / 4))
+    rate = FitConfig(steps=steps, learning_rate=3e-4, last_rate=3e-4, warmup=1, clip_norm=1e9, checkpoint_every=500)
+    return PointTrainingConfig(
+        model=PointModelConfig(),
+        fit=rate,
+        queries=QUERY_SIZE**2,
+        scan_points=40_000,
+        normals_from=250 / 401,
+        precision="float32",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSet:
+    """The frames of many sequences, counted through, on one body model."""
+
+    body: Body
+    scans: tuple[ScanSequence, ...]
+    outfits: tuple[str, ...]
+    input_size: int = INPUT_SIZE
+
+    @staticmethod
+    def of(body: Body, scans: Sequence[ScanSequence], input_size: int = INPUT_SIZE) -> "ScanSet":
+        """Raises ValueError where there is nothing to learn from."""
+        if not scans:
+            raise ValueError("there are no scans to learn from; make some with `python -m assets_gen scans`")
+        return ScanSet(body, tuple(scans), outfits_of(scans), input_size)
+
+    @cached_property
+    def places(self) -> tuple[tuple[int, int], ...]:
+        """(sequence, frame) of every scan."""
+        return tuple((k, t) for k, scan in enumerate(self.scans) for t in range(len(scan)))
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        return atlas_of(self.body, self.input_size)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def batch(self, index: Sequence[int]) -> "Batch":
+        """Frames by their number in the set."""
+        chosen = [self.places[i] for i in index]
+        sequences = [self.scans[k] for k, _ in chosen]
+        rotations = torch.stack([scan.rotations[t] for scan, (_, t) in zip(sequences, chosen, strict=True)])
+        bodies = posed_bodies(self.body, rotations, torch.stack([scan.betas for scan in sequences]))
+        return Batch(
+            bodies=bodies,
+            position_map=self.atlas.map_of(bodies.neutral),
+            outfit=torch.tensor([self.outfits.index(scan.outfit) for scan in sequences]),
+            scans=[scan.frame(t) for scan, (_, t) in zip(sequences, chosen, strict=True)],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """A few frames: what goes into a model and what should come out."""
+
+    bodies: PosedBodies
+    position_map: Float[Tensor, "B 3 H W"]
+    outfit: Int[Tensor, " B"]
+    scans: list[ScanFrame]
+
+
+def cloud_terms(cloud: ClothedPoints, scans: Sequence[ScanFrame], G: Float[Tensor, "C c H W"]) -> LossTerms:
+    """The terms of Eq. 3, a mean over the frames of a batch."""
+    distance, normal = [], []
+    for x, n_x, scan in zip(cloud.points, cloud.normals, scans, strict=True):
+        matches = match(x, scan.points)
+        distance.append(distance_loss(x, scan.points, matches))
+        normal.append(normal_loss(n_x, scan.normals, matches))
+    return LossTerms(
+        distance=torch.stack(distance).mean(),
+        normal=torch.stack(normal).mean(),
+        displacement=displacement_loss(cloud.displacement),
+        geometry=geometry_loss(G),
+    )
+
+
+def weights_at(step: int, config: PointTrainingConfig) -> LossWeights:
+    """Normals count only once the points are about where they belong (facts.md 2)."""
+    w = config.weights
+    early = step < config.normals_from * config.fit.steps
+    return LossWeights(w.distance, w.normal * (config.normals_before if early else 1.0), w.displacement, w.geometry)
+
+
+def train_points(
+    model: ClothesModel,
+    scans: ScanSet,
+    config: PointTrainingConfig,
+    *,
+    queries: SurfaceQueries | None = None,
+    checkpoint: Path | None = None,
+    watch: Callable[[int, float], None] | None = None,
+) -> FitResult:
+    """Minimise Eq. 3 over all parameters of the model, in place, then settle BatchNorm; resumes from `checkpoint`.
+
+    `queries`: the points to draw from (default: the pixels of the query map).  All chance comes from the config's seed.
+    """
+    places = atlas_of(scans.body, config.query_size).queries if queries is None else queries
+
+    def loss_of(step: int, generator: torch.Generator) -> Tensor:
+        batch, posed = _drawn(scans, places, config, generator)
+        with autocast(config.precision):
+            cloud = model(batch.position_map, batch.outfit, posed)
+        return cloud_terms(cloud, batch.scans, model.penalised()).total(weights_at(step, config))
+
+    _train_mode(model, training=True)
+    generator = torch.Generator().manual_seed(config.seed)
+    result = fit(
+        list(model.parameters()),
+        loss_of,
+        config.fit,
+        generator=generator,
+        checkpoint=checkpoint,
+        label="points",
+        watch=watch,
+    )
+    settle(model, scans, places, config)
+    return result
+
+
+def settle(model: ClothesModel, scans: ScanSet, places: SurfaceQueries, config: PointTrainingConfig) -> None:
+    """Means and variances of BatchNorm over some batches, then evaluation mode.
+
+    Ours: training itself never reads running statistics, so taking them once at the end makes a resumed run the same
+    as an uninterrupted one, and they belong to the final weights.
+    """
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+            module.reset_running_stats()
+    generator = torch.Generator().manual_seed(config.seed + 1)
+    _train_mode(model, training=True)
+    with torch.no_grad():
+        for _ in range(config.calibration):
+            batch, posed = _drawn(scans, places, config, generator)
+            model(batch.position_map, batch.outfit, posed)
+    _train_mode(model, training=False)
+
+
+def autocast(precision: Precision) -> torch.autocast:
+    """Networks in half precision where asked for."""
+    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bfloat16")
+
+
+def _drawn(
+    scans: ScanSet, places: SurfaceQueries, config: PointTrainingConfig, generator: torch.Generator
+) -> tuple[Batch, PosedQueries]:
+    batch = scans.batch(torch.randint(len(scans), (config.batch,), generator=generator).tolist())
+    asked = places
+    if config.queries < len(places):
+        asked = places.subset(torch.randperm(len(places), generator=generator)[: config.queries])
+    thinned = [thin(scan, config.scan_points, generator) for scan in batch.scans]
+    return Batch(batch.bodies, batch.position_map, batch.outfit, thinned), posed_queries(asked, batch.bodies)
+
+
+def thin(scan: ScanFrame, count: int, generator: torch.Generator) -> ScanFrame:
+    """A random subset of a scan (all of it where it has no more points)."""
+    if count >= len(scan.points):
+        return scan
+    index = torch.randperm(len(scan.points), generator=generator)[:count]
+    return ScanFrame(scan.points[index], scan.normals[index])
+
+
+def _train_mode(model: ClothesModel, *, training: bool) -> None:
+    for module in model.modules():
+        module.training = training
+
+
+# A trained model on disk
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedPoints:
+    """A trained model and the outfits that its G are of, in order."""
+
+    model: PointModel
+    outfits: tuple[str, ...]
+
+    def save(self, path: str | Path, body: Body) -> None:
+        """safetensors: parameters as float16, statistics as float32; written whole or not at all."""
+        tensors = {}
+        for name, tensor in self.model.state_dict().items():
+            statistic = "running" in name or "tracked" in name  # a small variance would vanish in float16
+            tensors[name] = tensor.detach().contiguous() if statistic else tensor.detach().half().contiguous()
+        metadata = {
+            "kind": KIND,
+            "made_for": atlas_fingerprint(body),
+            "config": json.dumps(asdict(self.model.config)),
+            "outfits": json.dumps(self.outfits),
+        }
+        with atomic_write(path) as part:
+            save_file(tensors, part, metadata=metadata)
+
+    @staticmethod
+    def load(path: str | Path, body: Body) -> "TrainedPoints":
+        """Raises ValueError for a missing, damaged or foreign file, or one trained for another body."""
+        path = Path(path)
+        if not path.is_file():
+            raise ValueError(f"there is no trained points model {path}")
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  not a dict
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"points model {path} is damaged ({error}); train or fetch it again") from error
+        if metadata.get("kind") != KIND:
+            raise ValueError(f"{path} is of kind {metadata.get('kind')!r}, expected {KIND!r}")
+        made_for, fingerprint = metadata.get("made_for"), atlas_fingerprint(body)
+        if made_for != fingerprint:
+            raise ValueError(
+                f"points model {path} was trained for another body ({made_for}, {body.name!r} is {fingerprint}); "
+                "train it for this body"
+            )
+        outfits = tuple(json.loads(metadata["outfits"]))
+        model = PointModel(len(outfits), _config_from(json.loads(metadata["config"])), generator=torch.Generator())
+        model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+        return TrainedPoints(model.eval(), outfits)
+
+
+def _config_from(stored: dict[str, dict]) -> PointModelConfig:
+    return PointModelConfig(
+        encoder=PoseEncoderConfig(**stored["encoder"]),
+        geometry=GeometryFeaturesConfig(**stored["geometry"]),
+        decoder=ShapeDecoderConfig(**stored["decoder"]),
+    )
