@@ -31,12 +31,12 @@ LICENCE = "CC0-1.0"  # derived from the default body, whose data are CC0
 @dataclass(frozen=True)
 class CheckpointsConfig:
     """Tabulate the fields and the SDF of the default body and train the paper's four networks (about 90 minutes on two
-    cores; a run that is killed continues its training)."""
+    cores; a run that is killed continues its training).  `--no-grids --training.networks sdf` makes the SDF's network
+    alone."""
 
     out: Path = Path("workbench/assets/fields")
     work: Path = Path("out/checkpoints")  # where training keeps its state
     grids: bool = True
-    networks: bool = True
     fields: GridFieldsConfig = GridFieldsConfig()
     sdf: GridSDFConfig = GridSDFConfig()
     training: TrainFieldsConfig = TrainFieldsConfig()
@@ -52,18 +52,23 @@ def run(config: CheckpointsConfig) -> None:
         with tqdm(desc="field grid", unit="level") as bar:
             GridFields.tabulate(body, config.fields, progress=_shown(bar)).save(config.out / "fields.npz")
         _record(config, "fields.npz", asdict(config.fields), config.fields.seed)
-    if config.networks:
-        trained = train(replace(config.training, out=config.work))
-        trained.fields.save(config.out)
-        trained.sdf.save(config.out)
-        for name, fitted in trained.fits.items():
-            _record(
-                config,
-                f"{name}.safetensors",
-                asdict(getattr(config.training, name)) | {"batch": config.training.batch},
-                config.training.seed,
-                {"training loss": round(fitted.loss, 5)},
-            )
+    trained = train(replace(config.training, out=config.work))
+    trained.save(config.out)
+    for name, fitted in trained.fits.items():
+        _record(
+            config,
+            f"{name}.safetensors",
+            asdict(getattr(config.training, name)) | _seen_by(name, config.training),
+            config.training.seed,
+            {"training loss": round(fitted.loss, 5)},
+        )
+
+
+def _seen_by(name: str, training: TrainFieldsConfig) -> dict:
+    """What the network was shown: points a step, and the pool they came from."""
+    if name == "sdf":
+        return {"batch": training.sdf_batch, "points": training.sdf_points}
+    return {"batch": training.batch, "pool": asdict(training.pool)}
 
 
 def _shown(bar: tqdm):

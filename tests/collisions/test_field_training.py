@@ -65,6 +65,33 @@ def test_a_killed_training_ends_where_the_uninterrupted_one_does(body, tmp_path,
     )
 
 
+def test_only_the_networks_asked_for_are_trained_and_written(tmp_path):
+    trained = run(replace(small(tmp_path), networks=("sdf",)))
+    assert list(trained.fits) == ["sdf"]
+    assert [file.name for file in tmp_path.glob("*.safetensors")] == ["sdf.safetensors"]
+
+
+def test_a_run_begins_where_its_start_ended(body, tmp_path):
+    first = run(replace(small(tmp_path / "first"), networks=("shape", "sdf")))
+    still = FitConfig(steps=1, learning_rate=0.0, last_rate=0.0)
+    again = run(
+        replace(
+            small(tmp_path / "again"),
+            networks=("shape", "sdf"),
+            start=tmp_path / "first",
+            shape=still,
+            sdf=still,
+        )
+    )
+    points = torch.rand(5, 3)
+    torch.testing.assert_close(again.sdf(points), first.sdf(points), atol=1e-2, rtol=1e-2)
+    assert (LearnedSDF(body)(points) - first.sdf(points)).abs().max() > 0.02
+    for one, two in zip(first.fields.shape_net.parameters(), again.fields.shape_net.parameters(), strict=True):
+        torch.testing.assert_close(two, one, atol=1e-3, rtol=1e-3)
+    with pytest.raises(ValueError, match="there is no trained network .*pose"):
+        run(replace(small(tmp_path / "none"), networks=("pose",), start=tmp_path / "first"))
+
+
 def test_the_pool_holds_the_definition(body):
     pool = make_pool(body, PoolConfig(points=200, samples=32), seed=0)
     truth = MonteCarloFields(body, samples=32, seed=0).expectation(pool.points)

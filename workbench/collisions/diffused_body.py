@@ -10,7 +10,7 @@ are smooth in p and repeatable (independent draws would make them noise).
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -355,18 +355,24 @@ class LearnedFields(DiffusedFields):
         """The three networks by the name of their checkpoint file."""
         return {"weights": self.weight_net, "shape": self.shape_net, "pose": self.pose_net}
 
-    def save(self, folder: str | Path) -> None:
-        """Write weights, shape and pose.safetensors (float16: measured harmless) into the folder."""
-        for name, network in self.networks().items():
+    def save(self, folder: str | Path, only: Collection[str] = ("weights", "shape", "pose")) -> None:
+        """Write weights, shape and pose.safetensors (float16: measured harmless), or some, into the folder."""
+        for name in self.networks().keys() & only:
+            network = self.networks()[name]
             save_network(network, Path(folder) / f"{name}.safetensors", kind=name, fingerprint=self.fingerprint)
 
     @staticmethod
     def load(folder: str | Path, body: Body) -> "LearnedFields":
         """Read what `save` wrote.  ValueError where a file is missing, damaged or made for another body."""
         fields = LearnedFields(body)
-        for name, network in fields.networks().items():
-            load_network(network, Path(folder) / f"{name}.safetensors", kind=name, fingerprint=fields.fingerprint)
+        fields.read(folder)
         return fields
+
+    def read(self, folder: str | Path, only: Collection[str] = ("weights", "shape", "pose")) -> None:
+        """Fill these networks, or some of them, with what `save` wrote.  Errors: as `load`'s."""
+        for name in self.networks().keys() & only:
+            path = Path(folder) / f"{name}.safetensors"
+            load_network(self.networks()[name], path, kind=name, fingerprint=self.fingerprint)
 
     @staticmethod
     def default(body: Body | None = None) -> "LearnedFields":

@@ -1,6 +1,5 @@
 """`workbench evaluate fields`: Eq. 4-6 and the SDF of Eq. 12, three implementations each.  body -> rows of figures."""
 
-import logging
 import statistics
 import time
 from collections.abc import Callable
@@ -18,8 +17,8 @@ from workbench.body_evaluation import body_rows
 from workbench.collisions.body_sdf import BodySDF, ExactSDF, GridSDF, LearnedSDF
 from workbench.collisions.diffused_body import (
     BOX_MARGIN,
-    FIELDS_FOLDER,
     DiffusedFields,
+    FieldValues,
     GridFields,
     LearnedFields,
     MonteCarloFields,
@@ -29,8 +28,6 @@ from workbench.collisions.field_training import random_pose_features
 from workbench.evaluation_table import Row, at_least, at_most, told
 from workbench.garments import Garment
 from workbench.geometry.sampling import sample_box, sample_surface
-
-log = logging.getLogger(__name__)
 
 MILLI = 1e3
 PERCENT = 100.0
@@ -45,7 +42,8 @@ class FieldEvaluation:
 
     networks: Path | None = None  # folder of trained networks (`workbench train fields`); default: those that ship
     samples: int = 4096  # of the reference, quasi-random, from another seed than any table or network
-    points: int = 2000  # a region
+    garment_points: int = 2400  # of each template: every second or third vertex (the reference takes 10 ms a point)
+    points: int = 1000  # a region
     surface_points: int = 40_000  # for the SDF
     repeats: int = 41  # timings: the median is told
     seed: int = 1
@@ -75,11 +73,11 @@ def _rows(config: FieldEvaluation) -> list[Row]:
     body = Body.default()
     grid, grid_sdf = GridFields.default(), GridSDF.default()
     learned = LearnedFields.load(config.networks, body) if config.networks else LearnedFields.default(body)
-    learned_sdf = _learned_sdf(config, body)
+    learned_sdf = LearnedSDF.load(config.networks, body) if config.networks else LearnedSDF.default(body)
     templates = {name: Garment.load(name).vertices for name in ("tshirt", "dress")}
     table = body_rows(body)
     for name, points in templates.items():
-        table += template_rows(name, points, body, learned, grid, config)
+        table += template_rows(name, _spread(points, config.garment_points), body, learned, grid, config)
     for region, points in regions(body, config.points, np.random.default_rng(config.seed)).items():
         table += region_rows(region, points, body, learned, grid, config)
     table += timing_rows(templates["tshirt"], body, learned, grid, config)
@@ -88,12 +86,10 @@ def _rows(config: FieldEvaluation) -> list[Row]:
         truth = exact(points)
         tabulated = MILLI * _mean_error(grid_sdf, points, truth)
         table.append(at_most(f"SDF at the {name}: tabulated, mean", tabulated, "mm", 0.20))
-        if learned_sdf is not None:
-            error = MILLI * _mean_error(learned_sdf, points, truth)
-            table.append(at_most(f"SDF at the {name}: learned, mean", error, "mm", PUBLISHED_SDF[name]))
+        error = MILLI * _mean_error(learned_sdf, points, truth)
+        table.append(at_most(f"SDF at the {name}: learned, mean", error, "mm", PUBLISHED_SDF[name]))
     table += surface_rows(body, exact, grid_sdf, config)
-    if learned_sdf is not None:
-        table += learned_surface_rows(body, exact, learned_sdf, config)
+    table += learned_surface_rows(body, exact, learned_sdf, config)
     table += sdf_timing_rows(templates["tshirt"], exact, learned_sdf, grid_sdf, config)
     return table
 
@@ -110,7 +106,7 @@ def template_rows(
     config: FieldEvaluation,
 ) -> list[Row]:
     """W~, B~s and B~p where a garment is, beside plain Monte Carlo as facts.md 1 gives it."""
-    truth = reference(body, config)
+    truth = reference(body, config).at(points)
     of_net, of_grid = field_errors([learned, grid], truth, points, body, config)
     table = [
         at_most(f"W~ at the {name}, L1: networks, mean", float(of_net.weights.mean()), "", 0.030),
@@ -123,10 +119,9 @@ def template_rows(
         ),
         told(f"W~ at the {name}, L1: published network", PUBLISHED_WEIGHTS, ""),
     ]
-    truth_weights = truth.weights(points)
     for samples in (50, 200, 1000):
         plain = MonteCarloFields(body, samples=samples, seed=config.seed, quasi=False).weights(points)
-        table.append(told(f"W~ at the {name}, L1: plain Monte Carlo, N = {samples}", _l1(plain, truth_weights), ""))
+        table.append(told(f"W~ at the {name}, L1: plain Monte Carlo, N = {samples}", _l1(plain, truth.weights), ""))
     table += _offset_rows(f"at the {name}", of_net, of_grid)
     return table
 
@@ -140,7 +135,8 @@ def region_rows(
     config: FieldEvaluation,
 ) -> list[Row]:
     """How far the three agree in a region of space within 0.5 m of the body.  Bounds are ours: measured, rounded up."""
-    of_net, of_grid = field_errors([learned, grid], reference(body, config), points, body, config)
+    truth = reference(body, config).at(points)
+    of_net, of_grid = field_errors([learned, grid], truth, points, body, config)
     return [
         at_most(f"W~ {region}, L1: networks, mean", float(of_net.weights.mean()), "", 0.10),
         at_most(f"W~ {region}, L1: grid, mean", float(of_grid.weights.mean()), "", 0.05),
@@ -166,7 +162,7 @@ def reference(body: Body, config: FieldEvaluation) -> MonteCarloFields:
 
 def field_errors(
     judged: list[DiffusedFields],
-    truth: DiffusedFields,
+    truth: FieldValues,
     points: Float[Tensor, "N 3"],
     body: Body,
     config: FieldEvaluation,
@@ -177,21 +173,25 @@ def field_errors(
     generator = torch.Generator().manual_seed(config.seed)
     betas = torch.randn(probes, body.shape_count, generator=generator)
     coefficients = random_pose_features(body, probes, seed=config.seed) @ body.pose_map
-    exact = truth.at(points)
-    shape = torch.einsum("bk,nki->bni", betas, exact.shape_directions)
-    pose = torch.einsum("bp,npi->bni", coefficients, exact.pose_directions)
+    shape = torch.einsum("bk,nki->bni", betas, truth.shape_directions)
+    pose = torch.einsum("bp,npi->bni", coefficients, truth.pose_directions)
     errors = []
     for fields in judged:
         shaped = torch.stack([fields.shape_offsets(points, beta) for beta in betas])
         posed = torch.stack([fields.pose_offsets(points, c @ _lift(body)) for c in coefficients])
         errors.append(
             FieldErrors(
-                (fields.weights(points) - exact.weights).abs().sum(-1),
+                (fields.weights(points) - truth.weights).abs().sum(-1),
                 _rms(shaped - shape),
                 _rms(posed - pose),
             )
         )
     return errors
+
+
+def _spread(points: Float[Tensor, "N 3"], most: int) -> Float[Tensor, "_ 3"]:
+    """Every k-th of the points, at most so many."""
+    return points[:: -(-len(points) // most)]
 
 
 def _lift(body: Body) -> Float[Tensor, "P Q"]:
@@ -275,15 +275,6 @@ def median_times(calls: list[Callable[[], object]], repeats: int) -> list[float]
 # The signed distance
 
 
-def _learned_sdf(config: FieldEvaluation, body: Body) -> LearnedSDF | None:
-    """The trained network, or None where there is none yet: it does not ship, `workbench train fields` makes it."""
-    folder = config.networks or FIELDS_FOLDER
-    if not (folder / "sdf.safetensors").is_file():
-        log.warning("no learned SDF in %s: its rows are left out; `workbench train fields` trains it", folder)
-        return None
-    return LearnedSDF.load(folder, body)
-
-
 @dataclass(frozen=True)
 class SurfaceProbe:
     """Points on the surface, moved off it along the normal, and in the box; with their exact distances."""
@@ -351,12 +342,10 @@ def _side(offset: float) -> str:
 
 
 def sdf_timing_rows(
-    points: Float[Tensor, "N 3"], exact: ExactSDF, learned: LearnedSDF | None, grid: GridSDF, config: FieldEvaluation
+    points: Float[Tensor, "N 3"], exact: ExactSDF, learned: LearnedSDF, grid: GridSDF, config: FieldEvaluation
 ) -> list[Row]:
     """One evaluation at a garment's vertices, one thread."""
-    sdfs: dict[str, BodySDF] = {"exact": exact, "tabulated": grid}
-    if learned is not None:
-        sdfs["learned"] = learned
+    sdfs: dict[str, BodySDF] = {"exact": exact, "tabulated": grid, "learned": learned}
     calls: list[Callable[[], object]] = [partial(sdf, points) for sdf in sdfs.values()]
     return [
         told(f"SDF at {len(points):,} points, one thread: {name}", MILLI * seconds, "ms")

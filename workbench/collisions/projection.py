@@ -31,8 +31,9 @@ class ProjectionConfig:
     carry_steps: int = 20  # averagings by which a bad vertex learns where its neighbours went
     newton_reach: float = 0.02  # metres a step at most
     tolerance: float = 2e-5  # metres of re-posing error at which a vertex rests
-    mended_error: float = 1e-4  # metres; vertices above it go to the optimisation
-    strain_weight: float = 1e-6  # omega_1 of Eq. 9: strain 0.5 weighs as much as 0.5 mm
+    newton_error: float = 1e-4  # metres; vertices above it are started again
+    mended_error: float = 1e-3  # metres; vertices above it go to the optimisation
+    strain_weight: float = 1e-7  # omega_1 of Eq. 9: a doubled edge weighs as much as 0.5 mm
     collision_weight: float = 4e-3  # omega_2 of Eq. 9: worth up to 2 mm of re-posing error
     clearance: float = 1e-3  # epsilon of Eq. 12, metres
     mend_rings: int = 1  # vertices around the bad ones that may move along
@@ -125,7 +126,7 @@ class Projector:
         guess: Guess,
     ) -> None:
         """Newton steps from another start for the vertices that are still wrong; the better answer stays (in place)."""
-        bad = errors > self.config.mended_error
+        bad = errors > self.config.newton_error
         if not bool(bad.any()):
             return
         frames = bad.any(dim=1).nonzero()[:, 0]
