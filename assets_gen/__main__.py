@@ -18,6 +18,7 @@ MAKERS = {
     "motions": ("assets_gen.motions", "MotionsConfig"),
     "checkpoints": ("assets_gen.checkpoints", "CheckpointsConfig"),
     "simulations": ("assets_gen.simulations", "SimulationsConfig"),
+    "scans": ("assets_gen.scans", "ScansConfig"),
 }
 
 
