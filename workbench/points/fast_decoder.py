@@ -2,8 +2,7 @@
 
 Against the plain decoder of the same weights: only pixels that show the body are decoded (62 % of the map on the
 default body); BatchNorm, at run time a linear map, is folded into the layer before it; the share of u_i and z_i^G in
-the first and the fifth layer is computed once an outfit; rows go through all layers in blocks that stay in the cache,
-in bfloat16 where the processor multiplies it.
+the first and the fifth layer is computed once an outfit; rows go through all layers in blocks that stay in the cache.
 """
 
 from dataclasses import dataclass
@@ -56,7 +55,7 @@ def folded(layer: DecoderLayer) -> Affine:
 class FastDecoder:
     """A trained decoder for inference only; it agrees with `ShapeDecoder` in evaluation mode up to rounding."""
 
-    def __init__(self, decoder: ShapeDecoder, pose_features: int, precision: torch.dtype = torch.bfloat16):
+    def __init__(self, decoder: ShapeDecoder, pose_features: int, precision: torch.dtype = torch.float32):
         """pose_features: how many of the decoder's inputs are z_P; the others never change for an outfit."""
         self.precision = precision
         moving = slice(COORDINATES, COORDINATES + pose_features)
