@@ -19,6 +19,7 @@ MAKERS = {
     "checkpoints": ("assets_gen.checkpoints", "CheckpointsConfig"),
     "simulations": ("assets_gen.simulations", "SimulationsConfig"),
     "scans": ("assets_gen.scans", "ScansConfig"),
+    "dataset": ("assets_gen.dataset", "DatasetConfig"),
 }
 
 

@@ -1,4 +1,4 @@
-"""`workbench export`: a dressed or a simulated sequence (.npz) -> .glb, .npz, or folders of OBJ, PLY or PC2."""
+"""`workbench export`: a dressed or a simulated sequence (.npz) -> .glb, .npz, OBJ, PLY or PC2; networks -> ONNX."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,6 +9,8 @@ import tyro
 
 from workbench.body.model import Body
 from workbench.collisions.sequences import SimulatedSequence
+from workbench.collisions.tryon import load_tryon
+from workbench.collisions.tryon_onnx import write_onnx
 from workbench.formats.gltf import dressed_meshes, write_glb
 from workbench.formats.mesh_sequence import (
     DressedSequence,
@@ -36,6 +38,8 @@ class ExportConfig:
     format: Format | None = None
     # Keep every n-th frame.
     every: int = 1
+    # Write the networks of the garment named in place of SEQUENCE to the folder `out`, as ONNX.
+    onnx: bool = False
 
 
 def run(config: ExportConfig) -> list[Path]:
@@ -43,6 +47,9 @@ def run(config: ExportConfig) -> list[Path]:
 
     Raises ValueError for an unknown format or a file that holds no sequence, FileNotFoundError.
     """
+    if config.onnx:
+        tryon = load_tryon(str(config.sequence), None)
+        return write_onnx(config.out, tryon.regressor, tryon.subspace)
     kind = config.format or _format_of(config.out)
     if config.every < 1:
         raise ValueError(f"--every {config.every} keeps no frame: give 1 or more")

@@ -7,6 +7,8 @@ from types import ModuleType
 EXTRAS = {
     "assets": ("newton", "anny", "dask", "distributed", "networkx"),
     "meshing": ("open3d",),
+    "runtime": ("onnx", "onnxruntime"),
+    "train": ("tensorboardX",),
     "lab": ("jupyterlab", "ipywidgets", "anywidget", "matplotlib"),
     "test": ("pytest", "xdist", "hypothesis", "beartype", "nbmake"),
 }

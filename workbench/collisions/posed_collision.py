@@ -1,0 +1,66 @@
+"""Beyond the paper: collisions in POSED space, without ground truth.  X (B,N,3), theta, beta -> hinge of the depth.
+
+Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
+touches nothing can end inside the posed body (facts.md 9).  This term poses garments on random shapes and motions and
+pushes what is inside, or nearer than a clearance, out along the way to the closest point of the posed body.
+
+The fields at X are held fixed in the gradient (as in fixed-point unskinning, which shows that it is good enough).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from workbench.collisions.garment_model import GarmentModel
+from workbench.geometry.closest_point import ClosestPoint
+from workbench.geometry.winding import InsideTest
+
+MILLI = 1e3
+
+
+@dataclass(frozen=True)
+class PosedCollision:
+    """`PosedCollision(model)(X, rotations, betas)`: mean over vertices of max(clearance - d, 0), millimetres."""
+
+    model: GarmentModel
+    clearance: float = 2e-3  # metres
+    reach: float = 0.04  # metres: deeper than this the closest surface is not the way out
+
+    @cached_property
+    def _closest(self) -> ClosestPoint:
+        body = self.model.body
+        return ClosestPoint(body.template.numpy(), body.faces.numpy())
+
+    @cached_property
+    def _inside(self) -> InsideTest:
+        body = self.model.body
+        return InsideTest(body.template.numpy(), body.faces.numpy())
+
+    def __call__(
+        self, X: Float[Tensor, "B N 3"], rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "B K"]
+    ) -> Float[Tensor, ""]:
+        with torch.no_grad():
+            state = self.model.state(rotations, betas)
+            local = self.model.local_map(X.detach(), state)
+            bodies = self.model.body.vertices(rotations, betas)
+        posed = local.posed(X)
+        return MILLI * (self.clearance - self.distance(posed, bodies)).clamp_min(0.0).mean()
+
+    def distance(self, posed: Float[Tensor, "B N 3"], bodies: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N"]:
+        """Signed distance to each body, differentiable in the points; beyond `reach` it says `reach`, constant."""
+        values = torch.full(posed.shape[:-1], self.reach)
+        directions = torch.zeros_like(posed)
+        for frame, (points, surface) in enumerate(zip(posed.detach().numpy(), bodies.numpy(), strict=True)):
+            self._closest.refit(surface)
+            hit = self._closest.query(points)
+            near = np.flatnonzero(hit.distance < self.reach)
+            self._inside.refit(surface)
+            sign = np.where(self._inside(points[near]), -1.0, 1.0).astype(np.float32)
+            away = (points[near] - hit.point[near]) / np.maximum(hit.distance[near, None], 1e-7)
+            values[frame, near] = torch.from_numpy(sign * hit.distance[near])
+            directions[frame, near] = torch.from_numpy(sign[:, None] * away)
+        return values + (directions * (posed - posed.detach())).sum(-1)

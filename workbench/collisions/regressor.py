@@ -1,0 +1,380 @@
+"""5, Eq. 1 and 18: the regressor.  beta (10), gamma (T,42) -> x_bar (T,25), X = D(x_bar).
+
+GRU 2 x 500, then a dense layer (facts.md 1).  The pose descriptor is first fitted so that what a pose does to the
+garment's template can be read off its 10 numbers, then trained together with the regressor.
+"""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from workbench.body.model import Body
+from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.motion_descriptor import (
+    DESCRIPTOR_SIZE,
+    POSE_SIZE,
+    PoseDescriptor,
+    descriptor,
+    global_motion,
+)
+from workbench.collisions.posed_collision import PosedCollision
+from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace
+from workbench.garments import Garment
+from workbench.learning.fit import FitConfig, FitResult, fit
+from workbench.learning.scalar_log import ScalarLog, read_curves
+from workbench.store import atomic_write
+
+log = logging.getLogger(__name__)
+
+HIDDEN, LAYERS = 500, 2  # facts.md 1
+FORMAT = "regressor-1"
+SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
+
+
+@dataclass(frozen=True)
+class RegressorWeights:
+    """Eq. 18 and the term in posed space.  The paper leaves rho_1 and rho_2 open; ours, on the validation sequences."""
+
+    velocity: float = 1.0  # rho_1, a frame
+    acceleration: float = 0.5  # rho_2, a frame squared
+    posed: float = 0.0  # mean hinge in posed space, millimetres (beyond the paper)
+    clearance: float = 2e-3  # metres, of the posed term
+
+
+@dataclass(frozen=True)
+class TrainRegressorConfig:
+    """`workbench train regressor`: from a trained subspace and the training set it was made of."""
+
+    garment: str = "tshirt"
+    # A set of canonical garments (.npz); the shipped one when absent.
+    data: Path | None = None
+    # The folder with GARMENT-subspace.safetensors, also written to.
+    out: Path = Path("out/models")
+    weights: RegressorWeights = RegressorWeights(posed=3.0)
+    window: int = 40  # frames
+    batch: int = 16  # windows a step
+    posed_every: int = 2  # steps between two with the posed term
+    posed_frames: int = 8  # frames a step that are posed, each from a random motion on a random shape
+    describe: FitConfig = field(default_factory=lambda: FitConfig(steps=1500, learning_rate=2e-3))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=4000, learning_rate=1e-3))
+    watch_every: int = 500
+    seed: int = 0
+
+
+class Regressor(nn.Module):
+    """x_bar = R(beta, gamma): GRU (2 x 500) and a dense layer; inputs standardised."""
+
+    centre: Tensor
+    size: Tensor
+
+    def __init__(
+        self, garment_name: str, joints: int, shapes: int, fps: float, generator: torch.Generator | None = None
+    ):
+        super().__init__()
+        generator = generator or torch.Generator().manual_seed(0)
+        self.garment_name, self.joints, self.shapes, self.fps = garment_name, joints, shapes, fps
+        self.describe = PoseDescriptor(joints, generator)
+        inputs = DESCRIPTOR_SIZE + shapes
+        self.register_buffer("centre", torch.zeros(inputs))
+        self.register_buffer("size", torch.ones(inputs))
+        self.gru = nn.GRU(inputs, HIDDEN, num_layers=LAYERS, batch_first=True)
+        self.last = nn.Linear(HIDDEN, LATENTS)
+        for parameter in (*self.gru.parameters(), *self.last.parameters()):
+            nn.init.uniform_(parameter, -(HIDDEN**-0.5), HIDDEN**-0.5, generator=generator)
+        self.story: dict = {}
+
+    def inputs(
+        self, rotations: Float[Tensor, "B T J 3 3"], translation: Float[Tensor, "B T 3"], betas: Float[Tensor, "B K"]
+    ) -> Float[Tensor, "B T I"]:
+        """gamma and beta of every frame, standardised; the root's motion is clipped at 5 standard deviations."""
+        moving = global_motion(rotations[..., 0, :, :], translation, self.fps).stacked()
+        gamma = descriptor(self.describe(rotations), moving, self.fps)
+        together = torch.cat([gamma, betas[:, None].expand(*gamma.shape[:2], -1)], dim=-1)
+        return ((together - self.centre) / self.size).clamp(-5, 5)
+
+    def forward(
+        self, rotations: Float[Tensor, "B T J 3 3"], translation: Float[Tensor, "B T 3"], betas: Float[Tensor, "B K"]
+    ) -> Float[Tensor, "B T L"]:
+        """The latents of whole motions, from rest (the recurrent state starts at zero)."""
+        hidden, _ = self.gru(self.inputs(rotations, translation, betas))
+        return self.last(hidden)
+
+    @torch.no_grad()
+    def standardise(self, sequences: Sequence[CanonicalSequence]) -> None:
+        """Set the inputs' mean and size from training sequences."""
+        rows = []
+        for s in sequences:
+            moving = global_motion(s.rotations[:, 0], s.translation, self.fps).stacked()
+            gamma = descriptor(self.describe(s.rotations), moving, self.fps)
+            rows.append(torch.cat([gamma, s.betas.expand(len(gamma), -1)], dim=-1))
+        every = torch.cat(rows)
+        self.centre.copy_(every.mean(0))
+        self.size.copy_(every.std(0).clamp_min(1e-3))
+        self.centre[-self.shapes :] = 0
+        self.size[-self.shapes :] = 1
+
+    def save(self, path: Path) -> None:
+        """safetensors, float16, with what made it."""
+        tensors = {name: tensor.detach().half().contiguous() for name, tensor in self.state_dict().items()}
+        metadata = {
+            "format": FORMAT,
+            "garment": self.garment_name,
+            "joints": str(self.joints),
+            "shapes": str(self.shapes),
+            "fps": str(self.fps),
+            "story": json.dumps(self.story),
+        }
+        with atomic_write(path) as part:
+            save_file(tensors, part, metadata=metadata)
+
+    @staticmethod
+    def load(path: str | Path) -> "Regressor":
+        """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"no regressor at {path}; train it with `workbench train regressor`")
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118  not a dict
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"{path} is damaged ({error}); train it again with `workbench train regressor`") from error
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path} is no regressor (format {metadata.get('format')!r}, expected {FORMAT!r})")
+        sizes = (int(metadata["joints"]), int(metadata["shapes"]), float(metadata["fps"]))
+        regressor = Regressor(metadata["garment"], *sizes)
+        regressor.load_state_dict(tensors)
+        regressor.story = json.loads(metadata["story"])
+        return regressor.eval()
+
+    @staticmethod
+    def shipped(garment_name: str) -> "Regressor":
+        """The regressor that ships for a garment.  Raises ValueError naming those there are."""
+        path = SHIPPED / f"{garment_name}-regressor.safetensors"
+        if not path.is_file():
+            known = ", ".join(sorted(p.name.rpartition("-")[0] for p in SHIPPED.glob("*-regressor.safetensors")))
+            raise ValueError(f"no regressor of garment {garment_name!r} ships; there are: {known or 'none'}")
+        return Regressor.load(path)
+
+
+# The three terms of Eq. 18, on frames that the simulation kept
+
+
+def position_loss(found: Float[Tensor, "B T L"], wanted: Float[Tensor, "B T L"], kept: Bool[Tensor, "B T"]) -> Tensor:
+    """L_pos of Eq. 18: L1 of the latents."""
+    return _masked(found - wanted, kept)
+
+
+def velocity_loss(found: Float[Tensor, "B T L"], wanted: Float[Tensor, "B T L"], kept: Bool[Tensor, "B T"]) -> Tensor:
+    """L_vel of Eq. 18, a frame."""
+    return _masked((found - wanted).diff(dim=1), kept[:, 1:] & kept[:, :-1])
+
+
+def acceleration_loss(
+    found: Float[Tensor, "B T L"], wanted: Float[Tensor, "B T L"], kept: Bool[Tensor, "B T"]
+) -> Tensor:
+    """L_acc of Eq. 18, a frame squared."""
+    return _masked((found - wanted).diff(n=2, dim=1), kept[:, 2:] & kept[:, 1:-1] & kept[:, :-2])
+
+
+def _masked(difference: Float[Tensor, "B T L"], kept: Bool[Tensor, "B T"]) -> Float[Tensor, ""]:
+    return (difference.abs().mean(-1) * kept).sum() / kept.sum().clamp_min(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Pieces of motions, side by side."""
+
+    rotations: Float[Tensor, "B T J 3 3"]
+    translation: Float[Tensor, "B T 3"]
+    betas: Float[Tensor, "B K"]
+    latents: Float[Tensor, "B T L"]
+    kept: Bool[Tensor, "B T"]
+
+
+@dataclass(frozen=True, eq=False)
+class RegressorTraining:
+    """One run: data with its latents, the regressor, the posed term."""
+
+    config: TrainRegressorConfig
+    body: Body
+    data: CanonicalSet
+    subspace: Subspace
+    latents: dict[str, list[Float[Tensor, "T L"]]]  # of every sequence of a split
+    regressor: Regressor
+    posed: PosedCollision
+
+    @staticmethod
+    def of(config: TrainRegressorConfig) -> "RegressorTraining":
+        data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
+        subspace = Subspace.load(config.out / f"{data.garment_name}-subspace.safetensors")
+        for parameter in subspace.parameters():
+            parameter.requires_grad_(False)
+        body = Body.default()
+        with torch.no_grad():
+            latents = {
+                split: [subspace.encode(data.garments(s.coefficients)) for s in data.of_split(split)]
+                for split in ("train", "validation")
+            }
+        regressor = Regressor(
+            data.garment_name,
+            len(body.parents),
+            body.shape_count,
+            data.fps,
+            torch.Generator().manual_seed(config.seed),
+        )
+        posed = PosedCollision(GarmentModel(body, GridFields.default()), clearance=config.weights.clearance)
+        return RegressorTraining(config, body, data, subspace, latents, regressor, posed)
+
+    def windows(self, split: str, count: int, length: int, generator: torch.Generator) -> Windows:
+        """`count` random windows of `length` frames (shorter sequences are repeated at their end, not kept there)."""
+        sequences, latents = self.data.of_split(split), self.latents[split]
+        which = torch.randint(len(sequences), (count,), generator=generator).tolist()
+        parts = []
+        for i in which:
+            s = sequences[i]
+            begin = int(torch.randint(max(1, len(s) - length + 1), (1,), generator=generator))
+            index = (begin + torch.arange(length)).clamp(max=len(s) - 1)
+            kept = s.valid[index] & (begin + torch.arange(length) < len(s))
+            parts.append((s.rotations[index], s.translation[index], s.betas, latents[i][index], kept))
+        return Windows(*(torch.stack(column) for column in zip(*parts, strict=True)))
+
+    def supervised(self, generator: torch.Generator) -> Float[Tensor, ""]:
+        """L_R of Eq. 18."""
+        w, batch = self.config.weights, self.windows("train", self.config.batch, self.config.window, generator)
+        found = self.regressor(batch.rotations, batch.translation, batch.betas)
+        given = (found, batch.latents, batch.kept)
+        return position_loss(*given) + w.velocity * velocity_loss(*given) + w.acceleration * acceleration_loss(*given)
+
+    def unsupervised(self, generator: torch.Generator) -> Float[Tensor, ""]:
+        """The posed term: random training motions on random shapes; one frame of each."""
+        count, length = self.config.posed_frames, self.config.window // 2
+        batch = self.windows("train", count, length, generator)
+        betas = torch.randn(batch.betas.shape, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT)
+        found = self.regressor(batch.rotations, batch.translation, betas)
+        frame = torch.randint(length // 2, length, (count,), generator=generator)
+        pick = torch.arange(count)
+        X = self.subspace.decode(found[pick, frame])
+        return self.posed(X, batch.rotations[pick, frame], betas)
+
+    def step(self, step: int, generator: torch.Generator) -> Float[Tensor, ""]:
+        loss = self.supervised(generator)
+        if self.config.weights.posed and step % self.config.posed_every == 0:
+            loss = loss + self.config.weights.posed * self.unsupervised(generator)
+        return loss
+
+
+def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
+    """theta_bar first: a small network has to read off it where the pose brings the template and the joints."""
+    config, body = training.config, training.body
+    generator = torch.Generator().manual_seed(config.seed + 3)
+    template = Garment.load(training.data.garment_name).vertices
+    chosen = torch.randperm(len(template), generator=generator)[:200]
+    model = training.posed.model
+    values = model.fields.at(template[chosen])
+    rotations = torch.cat([s.rotations for s in training.data.of_split("train")])
+    reader = nn.Sequential(nn.Linear(POSE_SIZE, 256), nn.ReLU(), nn.Linear(256, 3 * (len(chosen) + len(body.parents))))
+    for layer in (reader[0], reader[2]):
+        assert isinstance(layer, nn.Linear)
+        nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
+        nn.init.zeros_(layer.bias)
+
+    def loss_of(_: int, chance: torch.Generator) -> Float[Tensor, ""]:
+        index = torch.randint(len(rotations), (64,), generator=chance)
+        with torch.no_grad():
+            local = rotations[index].clone()
+            local[:, 0] = torch.eye(3)  # what the root does is not the pose's
+            posed = body.pose(local, body.mean_shape())
+            blended = torch.einsum("nj,bjik->bnik", values.weights, posed.transforms.rotation)
+            shift = torch.einsum("nj,bji->bni", values.weights, posed.transforms.translation)
+            points = torch.einsum("bnik,nk->bni", blended, template[chosen]) + shift
+            wanted = torch.cat([points, posed.joints], dim=1)
+        read = reader(training.regressor.describe(rotations[index])).unflatten(-1, (-1, 3))
+        return (read - wanted).norm(dim=-1).mean()
+
+    parameters = [*training.regressor.describe.parameters(), *reader.parameters()]
+    return fit(
+        parameters,
+        loss_of,
+        config.describe,
+        generator=torch.Generator().manual_seed(config.seed + 4),
+        checkpoint=work / "descriptor.safetensors",
+        label="pose descriptor",
+    )
+
+
+def run(config: TrainRegressorConfig) -> Regressor:
+    """Train (or continue), write `out`/GARMENT-regressor.safetensors with its curves, return it."""
+    training = RegressorTraining.of(config)
+    name = training.data.garment_name
+    work = config.out / "work" / f"{name}-regressor"
+    described = fit_descriptor(training, work)
+    regressor = training.regressor
+    regressor.standardise(training.data.of_split("train"))
+    result = train(training, work)
+    regressor.eval()
+    regressor.story = {
+        "config": json.loads(json.dumps(asdict(config), default=str)),
+        "descriptor loss": described.loss,
+        "loss": result.loss,
+        "curves": read_curves(work / "curves.jsonl"),
+    }
+    path = config.out / f"{name}-regressor.safetensors"
+    regressor.save(path)
+    log.info("written: %s (%.1f MB), loss %.3f", path, path.stat().st_size / 1e6, result.loss)
+    return regressor
+
+
+def train(training: RegressorTraining, work: Path) -> FitResult:
+    """Eq. 18, and the posed term, with a point of the curves every `watch_every` steps."""
+    config = training.config
+    curves: list[ScalarLog] = []
+
+    def watch(step: int, loss: float) -> None:
+        if not curves:
+            curves.append(ScalarLog(work, begin=step + 1))
+        if (step + 1) % config.watch_every == 0 or step + 1 == config.fit.steps:
+            curves[0].add(step + 1, {"loss": loss, **measure(training)})
+
+    return fit(
+        list(training.regressor.parameters()),
+        training.step,
+        config.fit,
+        generator=torch.Generator().manual_seed(config.seed + 1),
+        checkpoint=work / "checkpoint.safetensors",
+        label=f"regressor of {training.data.garment_name}",
+        watch=watch,
+    )
+
+
+@torch.no_grad()
+def measure(training: RegressorTraining) -> dict[str, float]:
+    """On sequences that the training does not see: error of the latents and of X [mm], and the hinge in posed space."""
+    latent_error, error, hinge, frames = 0.0, 0.0, 0.0, 0
+    for s, wanted in zip(training.data.of_split("validation"), training.latents["validation"], strict=True):
+        found = training.regressor(s.rotations[None], s.translation[None], s.betas[None])[0]
+        pick = torch.arange(0, len(s), 12)
+        pick = pick[s.valid[pick]]
+        if not len(pick):
+            continue
+        X = training.subspace.decode(found[pick])
+        truth = training.data.garments(s.coefficients[pick])
+        latent_error += float((found[pick] - wanted[pick]).abs().mean()) * len(pick)
+        error += 1e3 * float((X - truth).norm(dim=-1).mean()) * len(pick)
+        hinge += float(training.posed(X, s.rotations[pick], s.betas.expand(len(pick), -1))) * len(pick)
+        frames += len(pick)
+    return {
+        "validation latent error": latent_error / frames,
+        "validation error, mm": error / frames,
+        "validation posed hinge, mm": hinge / frames,
+    }

@@ -1,0 +1,434 @@
+"""4.4, Eq. 13-16: a generative subspace free of collisions.  X (N,3) -> x_bar (25) -> X (N,3).
+
+Deviation from the paper in the 2-core configuration: encoder and decoder learn what the leading principal components of
+the training frames leave: x_bar starts as the whitened leading coefficients, and the decoder's last layer goes through
+the components (learned further from there).  Plain dense networks of any size remember the training sequences instead
+(unseen frames came back worse than the mean garment).  `paper_size()` has the published form (facts.md 1).
+"""
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from workbench.collisions.body_sdf import BodySDF, GridSDF
+from workbench.collisions.canonical_set import CanonicalSet
+from workbench.garments import Garment
+from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.learning.fit import FitConfig, FitResult, fit
+from workbench.learning.scalar_log import ScalarLog, read_curves
+from workbench.store import atomic_write
+
+log = logging.getLogger(__name__)
+
+LATENTS = 25  # the paper, Sec. 5
+MILLI = 1e3  # losses are in millimetres
+LEAST_SPREAD = 3e-3  # metres: principal components that move less are not blown up to the others' size
+FORMAT = "subspace-1"
+SHIPPED = Path(__file__).parents[1] / "assets" / "models"
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of encoder and decoder: `depth` x [Dense width, ReLU, LayerNorm eps 1e-3] (facts.md 1: 4 x 2000)."""
+
+    width: int = 512  # ours: 2000 gains nothing that 40 minutes of two cores could train
+    depth: int = 4
+    rank: int = 256  # principal components in the first and last layer; 0: dense layers to and from all vertices
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Eq. 13, terms in millimetres.  The paper leaves all open; ours, measured on the validation sequences."""
+
+    laplacian: float = 1.0  # lambda_1
+    collision: float = 20.0  # lambda_2
+    kl: float = 4e-3  # lambda_3
+    self_supervised: bool = True  # the second term of Eq. 16
+    clearance: float = 2e-3  # epsilon of Eq. 16, metres
+
+
+@dataclass(frozen=True)
+class TrainSubspaceConfig:
+    """`workbench train subspace`: the VAE of one garment from its shipped (or given) training set."""
+
+    garment: str = "tshirt"
+    # A set of canonical garments (.npz, `python -m assets_gen dataset`); the shipped one when absent.
+    data: Path | None = None
+    out: Path = Path("out/models")
+    network: NetworkConfig = NetworkConfig()
+    weights: LossWeights = LossWeights()
+    batch: int = 32  # training frames a step
+    random_batch: int = 32  # latents drawn from N(0, I) a step
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=12_000, learning_rate=1e-3, checkpoint_every=500))
+    watch_every: int = 500  # steps between two points of the curves (Fig. 4)
+    seed: int = 0
+
+    @staticmethod
+    def paper_size() -> "TrainSubspaceConfig":
+        """The published sizes (38.6 million parameters in the decoder of the T-shirt): for a GPU or a night."""
+        return TrainSubspaceConfig(
+            network=NetworkConfig(width=2000, rank=0), batch=128, random_batch=128, fit=FitConfig(steps=50_000)
+        )
+
+
+class Trunk(nn.Module):
+    """[Dense, ReLU, LayerNorm] x depth."""
+
+    def __init__(self, inputs: int, config: NetworkConfig, generator: torch.Generator):
+        super().__init__()
+        layers: list[nn.Module] = []
+        for _ in range(config.depth):
+            dense = nn.Linear(inputs, config.width)
+            nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
+            nn.init.zeros_(dense.bias)
+            layers += [dense, nn.ReLU(), nn.LayerNorm(config.width, eps=1e-3)]
+            inputs = config.width
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Float[Tensor, "*B i"]) -> Float[Tensor, "*B w"]:
+        return self.layers(x)
+
+
+def _head(inputs: int, outputs: int, generator: torch.Generator, gain: float = 1.0) -> nn.Linear:
+    head = nn.Linear(inputs, outputs)
+    nn.init.normal_(head.weight, std=gain / inputs**0.5, generator=generator)
+    nn.init.zeros_(head.bias)
+    return head
+
+
+class Encoder(nn.Module):
+    """E: X (N,3) -> mean and log variance of x_bar (25)."""
+
+    middle: Tensor
+    view: Tensor
+
+    def __init__(self, statistics: "Statistics", config: NetworkConfig, generator: torch.Generator):
+        super().__init__()
+        self.register_buffer("middle", statistics.mean.flatten())
+        self.register_buffer("view", statistics.view)
+        self.trunk = Trunk(statistics.view.shape[-1], config, generator)
+        self.mean = _head(config.width, LATENTS, generator, gain=0.1 if config.rank else 1.0)
+        self.log_variance = _head(config.width, LATENTS, generator, gain=0.1)
+
+    def forward(self, X: Float[Tensor, "B N 3"]) -> tuple[Float[Tensor, "B L"], Float[Tensor, "B L"]]:
+        moved = X.flatten(1) - self.middle
+        if self.view.dim() == 1:
+            hidden = self.trunk(moved * self.view)
+            return self.mean(hidden), self.log_variance(hidden).clamp(-12, 4)
+        seen = moved @ self.view
+        hidden = self.trunk(seen)
+        return seen[:, :LATENTS] + self.mean(hidden), self.log_variance(hidden).clamp(-12, 4)
+
+
+class Decoder(nn.Module):
+    """D: x_bar (25) -> X (N,3)."""
+
+    def __init__(self, statistics: "Statistics", config: NetworkConfig, generator: torch.Generator):
+        super().__init__()
+        self.trunk = Trunk(LATENTS, config, generator)
+        self.amounts = _head(config.width, len(statistics.basis), generator, gain=0.1)
+        self.basis = nn.Parameter(statistics.basis.clone())  # amounts of about 1 -> metres
+        self.middle = nn.Parameter(statistics.mean.flatten().clone())
+
+    def forward(self, latent: Float[Tensor, "*B L"]) -> Float[Tensor, "*B N 3"]:
+        amounts = self.amounts(self.trunk(latent))
+        amounts = amounts + nn.functional.pad(latent, (0, amounts.shape[-1] - LATENTS))
+        return (self.middle + amounts @ self.basis).unflatten(-1, (-1, 3))
+
+
+class DenseDecoder(nn.Module):
+    """D as published: a dense last layer to all vertices, de-normalised by mean and standard deviation."""
+
+    middle: Tensor
+    spread: Tensor
+
+    def __init__(self, statistics: "Statistics", config: NetworkConfig, generator: torch.Generator):
+        super().__init__()
+        self.trunk = Trunk(LATENTS, config, generator)
+        self.last = _head(config.width, statistics.mean.numel(), generator)
+        self.register_buffer("middle", statistics.mean.flatten())
+        self.register_buffer("spread", statistics.spread.flatten())
+
+    def forward(self, latent: Float[Tensor, "*B L"]) -> Float[Tensor, "*B N 3"]:
+        return (self.middle + self.last(self.trunk(latent)) * self.spread).unflatten(-1, (-1, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What the networks know of the training frames before they learn."""
+
+    mean: Float[Tensor, "N 3"]
+    spread: Float[Tensor, "N 3"]  # standard deviation, metres
+    view: Float[Tensor, "N3 I"] | Float[Tensor, "N3"]  # X - mean -> the encoder's input: a matrix, or a factor each
+    basis: Float[Tensor, "R N3"]  # amounts of about 1 -> metres
+
+    @staticmethod
+    def of(data: CanonicalSet, config: NetworkConfig) -> "Statistics":
+        amounts = data.kept("train")
+        basis = data.flat_basis
+        spread = ((amounts - amounts.mean(0)).square().mean(0)[:, None] * basis.square()).sum(0).sqrt()
+        spread = spread.unflatten(0, (-1, 3)).clamp_min(LEAST_SPREAD)
+        if not config.rank:
+            return Statistics(data.mean, spread, 1 / spread.flatten(), basis[:0])
+        basis = basis[: config.rank]
+        size = amounts[:, : config.rank].std(0)
+        view = basis.T / len(data.mean) / (size + LEAST_SPREAD)
+        return Statistics(data.mean, spread, view, basis * (size + LEAST_SPREAD)[:, None])
+
+    @staticmethod
+    def blank(vertices: int, config: NetworkConfig) -> "Statistics":
+        """Of the right shapes, to be filled from a file."""
+        flat = 3 * vertices
+        zero = torch.zeros(vertices, 3)
+        view = torch.zeros(flat, config.rank) if config.rank else torch.ones(flat)
+        return Statistics(zero, zero, view, torch.zeros(config.rank, flat))
+
+
+class Subspace(nn.Module):
+    """The VAE of one garment: `encode`, `decode`, `sample`; made for one topology."""
+
+    def __init__(
+        self, garment_name: str, statistics: Statistics, config: NetworkConfig, generator: torch.Generator | None = None
+    ):
+        super().__init__()
+        generator = generator or torch.Generator().manual_seed(0)
+        self.garment_name, self.config = garment_name, config
+        self.encoder = Encoder(statistics, config, generator)
+        self.decoder: Decoder | DenseDecoder = (Decoder if config.rank else DenseDecoder)(statistics, config, generator)
+        self.story: dict = {}  # what made it: configuration, curves, scores
+
+    @property
+    def vertex_count(self) -> int:
+        return self.decoder.middle.numel() // 3
+
+    def encode(self, X: Float[Tensor, "B N 3"]) -> Float[Tensor, "B L"]:
+        """x_bar of canonical garments: the mean of E(X)."""
+        if X.shape[-2] != self.vertex_count:
+            raise ValueError(
+                f"the garment has {X.shape[-2]} vertices, but the subspace of {self.garment_name!r} {self.vertex_count}"
+            )
+        return self.encoder(X)[0]
+
+    def decode(self, latent: Float[Tensor, "*B L"]) -> Float[Tensor, "*B N 3"]:
+        """X = D(x_bar), metres, canonical space."""
+        if latent.shape[-1] != LATENTS:
+            raise ValueError(f"a latent has {LATENTS} numbers, got {latent.shape[-1]}")
+        return self.decoder(latent)
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "B N 3"]:
+        """Garments decoded from N(0, I)."""
+        return self.decode(torch.randn(count, LATENTS, generator=generator))
+
+    def save(self, path: Path) -> None:
+        """safetensors, float16 (measured harmless: 0.03 mm), with what made it."""
+        tensors = {name: tensor.detach().half().contiguous() for name, tensor in self.state_dict().items()}
+        metadata = {
+            "format": FORMAT,
+            "garment": self.garment_name,
+            "vertices": str(self.vertex_count),
+            "network": json.dumps(asdict(self.config)),
+            "story": json.dumps(self.story),
+        }
+        with atomic_write(path) as part:
+            save_file(tensors, part, metadata=metadata)
+
+    @staticmethod
+    def load(path: str | Path) -> "Subspace":
+        """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"no subspace at {path}; train it with `workbench train subspace`")
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118  not a dict
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"{path} is damaged ({error}); train it again with `workbench train subspace`") from error
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path} is no subspace (format {metadata.get('format')!r}, expected {FORMAT!r})")
+        config = NetworkConfig(**json.loads(metadata["network"]))
+        blank = Statistics.blank(int(metadata["vertices"]), config)
+        subspace = Subspace(metadata["garment"], blank, config)
+        subspace.load_state_dict(tensors)
+        subspace.story = json.loads(metadata["story"])
+        return subspace.eval()
+
+    @staticmethod
+    def shipped(garment_name: str) -> "Subspace":
+        """The subspace that ships for a garment.  Raises ValueError naming those there are."""
+        path = SHIPPED / f"{garment_name}-subspace.safetensors"
+        if not path.is_file():
+            known = ", ".join(sorted(p.name.rpartition("-")[0] for p in SHIPPED.glob("*-subspace.safetensors")))
+            raise ValueError(f"no subspace of garment {garment_name!r} ships; there are: {known or 'none'}")
+        return Subspace.load(path)
+
+
+# The four terms of Eq. 13, in millimetres
+
+
+def reconstruction_loss(X: Float[Tensor, "B N 3"], decoded: Float[Tensor, "B N 3"]) -> Float[Tensor, ""]:
+    """| X - D(E(X)) |_1      (Eq. 14), a number"""
+    return MILLI * (X - decoded).abs().mean()
+
+
+def laplacian_loss(
+    X: Float[Tensor, "B N 3"], decoded: Float[Tensor, "B N 3"], laplacian: Float[Tensor, "N N"]
+) -> Float[Tensor, ""]:
+    """| Delta X - Delta D(E(X)) |_1      (Eq. 15)"""
+    return MILLI * apply_laplacian(laplacian, X - decoded).abs().mean()
+
+
+def collision_loss(sdf: BodySDF, decoded: Float[Tensor, "B N 3"], clearance: float) -> Float[Tensor, ""]:
+    """max(epsilon - SDF(X), 0), mean over the vertices      (one term of Eq. 16)
+
+    Only vertices that are too near have a gradient: the others are looked up without one.
+    """
+    with torch.no_grad():
+        near = sdf(decoded.detach()) < clearance
+    return MILLI * (clearance - sdf(decoded[near])).clamp_min(0.0).sum() / near.numel()
+
+
+def kl_loss(mean: Float[Tensor, "B L"], log_variance: Float[Tensor, "B L"]) -> Float[Tensor, ""]:
+    """KL(N(mean, variance) || N(0, I)), mean over the batch."""
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1).mean()
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceLoss:
+    """L_VAE of one step."""
+
+    sdf: BodySDF
+    laplacian: Float[Tensor, "N N"]
+    weights: LossWeights
+
+    def __call__(
+        self,
+        subspace: Subspace,
+        X: Float[Tensor, "B N 3"],
+        generator: torch.Generator,
+        random_batch: int,
+    ) -> Float[Tensor, ""]:
+        w = self.weights
+        mean, log_variance = subspace.encoder(X)
+        noise = torch.randn(mean.shape, generator=generator)
+        decoded = subspace.decode(mean + (0.5 * log_variance).exp() * noise)
+        rec = reconstruction_loss(X, decoded)
+        lap = laplacian_loss(X, decoded, self.laplacian)
+        kl = kl_loss(mean, log_variance)
+        col = collision_loss(self.sdf, decoded, w.clearance)
+        if w.self_supervised:
+            imagined = subspace.sample(random_batch, generator)
+            col = col + collision_loss(self.sdf, imagined, w.clearance)  # Eq. 16
+        return rec + w.laplacian * lap + w.collision * col + w.kl * kl  # Eq. 13
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceTraining:
+    """One run: data, networks, loss; `run(config)` does it all."""
+
+    config: TrainSubspaceConfig
+    data: CanonicalSet
+    subspace: Subspace
+    loss: SubspaceLoss
+
+    @staticmethod
+    def of(config: TrainSubspaceConfig) -> "SubspaceTraining":
+        data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
+        faces = garment_faces(data)
+        network = replace(config.network, rank=min(config.network.rank, data.rank))
+        generator = torch.Generator().manual_seed(config.seed)
+        subspace = Subspace(data.garment_name, Statistics.of(data, network), network, generator)
+        laplacian = umbrella_laplacian(faces, len(data.mean))
+        return SubspaceTraining(config, data, subspace, SubspaceLoss(GridSDF.default(), laplacian, config.weights))
+
+    @cached_property
+    def frames(self) -> Float[Tensor, "M R"]:
+        return self.data.kept("train")
+
+    def step(self, _: int, generator: torch.Generator) -> Float[Tensor, ""]:
+        index = torch.randint(len(self.frames), (self.config.batch,), generator=generator)
+        return self.loss(self.subspace, self.data.garments(self.frames[index]), generator, self.config.random_batch)
+
+
+def run(config: TrainSubspaceConfig) -> Subspace:
+    """Train (or continue), write `out`/GARMENT-subspace.safetensors with its curves, return it."""
+    training = SubspaceTraining.of(config)
+    work = config.out / "work" / f"{training.data.garment_name}-subspace"
+    result = train(training, work)
+    subspace = training.subspace.eval()
+    subspace.story = {
+        "config": _plain(config),
+        "loss": result.loss,
+        "curves": read_curves(work / "curves.jsonl"),
+    }
+    path = config.out / f"{training.data.garment_name}-subspace.safetensors"
+    subspace.save(path)
+    log.info("written: %s (%.1f MB), loss %.3f", path, path.stat().st_size / 1e6, result.loss)
+    return subspace
+
+
+def train(training: SubspaceTraining, work: Path) -> FitResult:
+    """The optimisation, with a point of the curves every `watch_every` steps."""
+    config, checkpoint = training.config, work / "checkpoint.safetensors"
+    curves: list[ScalarLog] = []
+
+    def watch(step: int, loss: float) -> None:
+        if not curves:
+            curves.append(ScalarLog(work, begin=step + 1))
+        if (step + 1) % config.watch_every == 0 or step + 1 == config.fit.steps:
+            curves[0].add(step + 1, {"loss": loss, **measure(training)})
+
+    return fit(
+        list(training.subspace.parameters()),
+        training.step,
+        config.fit,
+        generator=torch.Generator().manual_seed(config.seed + 1),
+        checkpoint=checkpoint,
+        label=f"subspace of {training.data.garment_name}",
+        watch=watch,
+    )
+
+
+@torch.no_grad()
+def measure(training: SubspaceTraining, frames: int = 256, samples: int = 256) -> dict[str, float]:
+    """On sequences that the training does not see: reconstruction error [mm], collisions [% of vertices]; the same
+    collisions for garments drawn from N(0, I)."""
+    generator = torch.Generator().manual_seed(17)
+    unseen = training.data.kept("validation")
+    X = training.data.garments(unseen[torch.randperm(len(unseen), generator=generator)[:frames]])
+    decoded = training.subspace.decode(training.subspace.encode(X))
+    imagined = training.subspace.sample(samples, generator)
+    return {
+        "validation error, mm": float(MILLI * (decoded - X).norm(dim=-1).mean()),
+        "validation inside, %": share_inside(training.loss.sdf, decoded),
+        "samples inside, %": share_inside(training.loss.sdf, imagined),
+    }
+
+
+def share_inside(sdf: Callable[[Tensor], Tensor], X: Float[Tensor, "B N 3"]) -> float:
+    """Vertices inside the canonical body, percent."""
+    return 100 * float((sdf(X) < 0).float().mean())
+
+
+def garment_faces(data: CanonicalSet) -> Int[Tensor, "F 3"]:
+    """The topology of the set's garment.  Raises ValueError when the garment has another vertex count."""
+    garment = Garment.load(data.garment_name)
+    if len(garment.vertices) != len(data.mean):
+        raise ValueError(
+            f"the training set has {len(data.mean)} vertices, but garment {data.garment_name!r} "
+            f"{len(garment.vertices)}; it was made for another garment"
+        )
+    return garment.faces
+
+
+def _plain(config: TrainSubspaceConfig) -> dict:
+    return json.loads(json.dumps(asdict(config), default=str))

@@ -1,0 +1,281 @@
+"""5-6: the runtime.  beta (10), motion -> x_bar (T,25) -> X (T,N,3) -> posed garment (T,N,3).
+
+`TryOn.run` dresses a whole motion; `TryOn.stream` a frame at a time, with the same result.  The networks run in torch,
+or in onnxruntime (`with_onnx`); the fields come from the table, or from the paper's networks (`GarmentModel`'s fields).
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from torch import Tensor
+
+from workbench.body.model import Body
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.motion_descriptor import DescriptorStream
+from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
+from workbench.collisions.subspace import Subspace
+from workbench.formats import load_motion
+from workbench.garments import Garment
+from workbench.motion import Motion
+from workbench.store import atomic_write
+
+log = logging.getLogger(__name__)
+
+FARTHEST_SHAPE = 5.0  # standard deviations: beyond it the linear body is no body any more
+POSED_AT_ONCE = 32  # frames: bounds the memory
+
+
+@dataclass(frozen=True, eq=False)
+class TryOnResult:
+    """A dressed motion, every stage of it."""
+
+    latent: Float[Tensor, "T L"]
+    canonical: Float[Tensor, "T N 3"]
+    garment: Float[Tensor, "T N 3"]
+    body: Float[Tensor, "T V 3"]
+    garment_faces: Tensor
+    body_faces: Tensor
+    betas: Float[Tensor, "K"]
+    motion: Motion
+
+    def save(self, path: str | Path) -> None:
+        """npz as the command contract names its arrays; written whole or not at all."""
+        arrays = {
+            "body_vertices": self.body.numpy(),
+            "body_faces": self.body_faces.numpy().astype(np.int32),
+            "garment_vertices": self.garment.numpy(),
+            "garment_faces": self.garment_faces.numpy().astype(np.int32),
+            "canonical": self.canonical.numpy(),
+            "latent": self.latent.numpy(),
+            "betas": self.betas.numpy(),
+            "fps": np.array(self.motion.fps),
+        }
+        with atomic_write(path) as part:
+            np.savez(part, **arrays)
+
+
+class Networks(Protocol):
+    """One step of the regressor and the decoder: all that a stream needs of a runtime."""
+
+    def regress(
+        self, inputs: Float[Tensor, "I"], hidden: Float[Tensor, "Y 1 H"]
+    ) -> tuple[Float[Tensor, "L"], Float[Tensor, "Y 1 H"]]: ...
+
+    def decode(self, latent: Float[Tensor, "L"]) -> Float[Tensor, "N 3"]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class TorchNetworks:
+    """The networks as they were trained."""
+
+    regressor: Regressor
+    subspace: Subspace
+
+    def regress(
+        self, inputs: Float[Tensor, "I"], hidden: Float[Tensor, "Y 1 H"]
+    ) -> tuple[Float[Tensor, "L"], Float[Tensor, "Y 1 H"]]:
+        out, hidden = self.regressor.gru(inputs[None, None], hidden)
+        return self.regressor.last(out)[0, 0], hidden
+
+    def decode(self, latent: Float[Tensor, "L"]) -> Float[Tensor, "N 3"]:
+        return self.subspace.decode(latent)
+
+
+@dataclass(frozen=True, eq=False)
+class TryOn:
+    """Dresses a body in one garment."""
+
+    model: GarmentModel
+    regressor: Regressor
+    subspace: Subspace
+    garment: Garment
+    networks: Networks
+
+    @staticmethod
+    def shipped(garment_name: str) -> "TryOn":
+        """With the networks that ship for a garment, on the default body."""
+        return TryOn.of(Subspace.shipped(garment_name), Regressor.shipped(garment_name))
+
+    @staticmethod
+    def of(subspace: Subspace, regressor: Regressor, model: GarmentModel | None = None) -> "TryOn":
+        """Raises ValueError when the networks belong to different garments, or the garment or body to neither."""
+        model = model or GarmentModel(Body.default(), GridFields.default())
+        if subspace.garment_name != regressor.garment_name:
+            raise ValueError(
+                f"the subspace is of garment {subspace.garment_name!r}, but the regressor of "
+                f"{regressor.garment_name!r}; load a pair that was trained together"
+            )
+        garment = Garment.load(subspace.garment_name)
+        if len(garment.vertices) != subspace.vertex_count:
+            raise ValueError(
+                f"garment {garment.name!r} has {len(garment.vertices)} vertices, but its subspace "
+                f"{subspace.vertex_count}; train it again with `workbench train subspace`"
+            )
+        joints = len(model.body.parents)
+        if joints != regressor.joints:
+            raise ValueError(f"the body has {joints} joints, but the regressor was trained for {regressor.joints}")
+        return TryOn(model, regressor, subspace, garment, TorchNetworks(regressor, subspace))
+
+    def stream(self, betas: Float[Tensor, "K"]) -> "TryOnStream":
+        """Frame by frame, for one shape."""
+        return TryOnStream(self, checked_shape(betas, self.model.body))
+
+    @torch.no_grad()
+    def latents(self, motion: Motion, betas: Float[Tensor, "K"]) -> Float[Tensor, "T L"]:
+        """x_bar of every frame      (Eq. 1)"""
+        motion = self._at_rate(motion)
+        return self.regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
+
+    @torch.no_grad()
+    def run(
+        self, motion: Motion, betas: Float[Tensor, "K"], progress: Callable[[int], None] = lambda frames: None
+    ) -> TryOnResult:
+        """A whole motion, resampled to the networks' frame rate.
+
+        Errors: ValueError for a shape of the wrong length, of NaN or beyond FARTHEST_SHAPE, or another skeleton.
+        """
+        betas = checked_shape(betas, self.model.body)
+        motion = self._at_rate(motion)
+        latent = self.latents(motion, betas)
+        canonical, garment, bodies = [], [], []
+        for part in torch.arange(len(motion)).split(POSED_AT_ONCE):
+            rotations, translation = motion.rotations[part], motion.translation[part]
+            X = self.subspace.decode(latent[part])
+            canonical.append(X)
+            garment.append(self.model.posed(X, self.model.state(rotations, betas, translation)))
+            bodies.append(self.model.body.vertices(rotations, betas, translation))
+            progress(len(part))
+        return TryOnResult(
+            latent=latent,
+            canonical=torch.cat(canonical),
+            garment=torch.cat(garment),
+            body=torch.cat(bodies),
+            garment_faces=self.garment.faces,
+            body_faces=self.model.body.faces,
+            betas=betas,
+            motion=motion,
+        )
+
+    def _at_rate(self, motion: Motion) -> Motion:
+        if len(motion.skeleton.names) != self.regressor.joints:
+            raise ValueError(
+                f"motion {motion.name!r} has {len(motion.skeleton.names)} joints, but the networks were trained for "
+                f"{self.regressor.joints}; load it with workbench.load_motion(file, body), which retargets it"
+            )
+        if abs(motion.fps - self.regressor.fps) < 1e-3:
+            return motion
+        return motion.resampled(self.regressor.fps)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a stream gives for one frame."""
+
+    latent: Float[Tensor, "L"]
+    canonical: Float[Tensor, "N 3"]
+    garment: Float[Tensor, "N 3"]
+
+
+class TryOnStream:
+    """`stream(rotations, translation)` -> Frame; keeps the recurrent state and the last frames' descriptor."""
+
+    def __init__(self, tryon: TryOn, betas: Float[Tensor, "K"]):
+        self.tryon, self.betas = tryon, betas
+        self.describe = DescriptorStream(tryon.regressor.describe, tryon.regressor.fps)
+        self.hidden = torch.zeros(LAYERS, 1, HIDDEN)
+
+    @torch.no_grad()
+    def __call__(self, rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]) -> Frame:
+        """The next frame, at the networks' frame rate."""
+        tryon = self.tryon
+        gamma = self.describe(rotations, translation)
+        regressor = tryon.regressor
+        inputs = ((torch.cat([gamma, self.betas]) - regressor.centre) / regressor.size).clamp(-5, 5)
+        latent, self.hidden = tryon.networks.regress(inputs, self.hidden)
+        X = tryon.networks.decode(latent)
+        state = tryon.model.state(rotations, self.betas, translation)
+        return Frame(latent, X, tryon.model.posed(X, state))
+
+
+def checked_shape(betas: Float[Tensor, "_"], body: Body) -> Float[Tensor, "K"]:
+    """betas, if a body can have them.  Raises ValueError for a wrong length, NaN, or a shape far beyond any person."""
+    if len(betas) != body.shape_count:
+        raise ValueError(f"a shape has {body.shape_count} numbers, got {len(betas)}")
+    if not bool(torch.isfinite(betas).all()):
+        raise ValueError(f"the shape holds NaN or infinity: {betas.tolist()}")
+    worst = int(betas.abs().argmax())
+    if float(betas[worst].abs()) > FARTHEST_SHAPE:
+        raise ValueError(
+            f"shape component {worst} is {float(betas[worst]):g} standard deviations from the mean; beyond "
+            f"{FARTHEST_SHAPE:g} the linear body is no body any more: give smaller numbers"
+        )
+    return betas
+
+
+@dataclass(frozen=True)
+class TryOnConfig:
+    """Dress a body in a garment through any motion file."""
+
+    # The name of a garment whose networks ship, such as tshirt.
+    garment: tyro.conf.Positional[str]
+    # BVH, AMASS npz, or our own npz.
+    motion: Path
+    # The dressed sequence, npz.
+    out: Path
+    # The body's shape, up to 10 numbers in standard deviations, with commas; what is left out is 0.
+    betas: str = ""
+    # Rotate arms and legs clear of the body first: cloth cannot be where the body overlaps itself.
+    clear: bool = True
+    # A folder of networks (`workbench train`); those that ship when absent.
+    networks: Path | None = None
+
+
+def run(config: TryOnConfig) -> TryOnResult:
+    """Load, clear, dress, write."""
+    tryon = load_tryon(config.garment, config.networks)
+    body = tryon.model.body
+    betas = shape_from_words(config.betas, body)
+    motion = load_motion(config.motion, body)
+    if abs(motion.fps - tryon.regressor.fps) > 1e-3:
+        motion = motion.resampled(tryon.regressor.fps)
+    if config.clear:
+        motion = motion.cleared(body, betas=betas)
+    result = tryon.run(motion, betas)
+    result.save(config.out)
+    return result
+
+
+def load_tryon(garment: str, networks: Path | None) -> TryOn:
+    """The networks that ship for a garment, or those of a folder."""
+    if networks is None:
+        return TryOn.shipped(garment)
+    return TryOn.of(
+        Subspace.load(networks / f"{garment}-subspace.safetensors"),
+        Regressor.load(networks / f"{garment}-regressor.safetensors"),
+    )
+
+
+def shape_from_words(words: str, body: Body) -> Float[Tensor, "K"]:
+    """ "1,-0.5" -> a full shape vector.  Raises ValueError for what is no number, or too many."""
+    try:
+        given = [float(word) for word in words.split(",") if word.strip()]
+    except ValueError as error:
+        raise ValueError(f"--betas {words!r} must be numbers with commas, such as 1,-0.5,2") from error
+    if len(given) > body.shape_count:
+        raise ValueError(f"{len(given)} betas given, but the body has {body.shape_count} shape components")
+    full = body.mean_shape()
+    full[: len(given)] = torch.tensor(given)
+    return checked_shape(full, body)
+
+
+def with_networks(tryon: TryOn, networks: Networks) -> TryOn:
+    """The same try-on on another runtime."""
+    return replace(tryon, networks=networks)

@@ -1,0 +1,156 @@
+"""6.3: the runtime's networks as ONNX.  Regressor, Subspace <-> two graphs, one frame a call.
+
+The graphs are written operator by operator (GRU, Gemm, LayerNormalization), so that nothing of torch is needed to run
+them: `regressor.onnx` inputs (1,1,I), hidden (2,1,H) -> latent (1,L), next hidden; `decoder.onnx` latent -> X (1,3N).
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from workbench.collisions.motion_descriptor import DESCRIPTOR_SIZE
+from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
+from workbench.collisions.subspace import LATENTS, Decoder, DenseDecoder, Subspace
+from workbench.extras import require
+from workbench.store import atomic_write
+
+OPSET = 20
+GATES = (1, 0, 2)  # torch stores reset, update, new; ONNX update, reset, new
+
+
+@dataclass
+class Graph:
+    """Nodes and constants of a graph that is being written."""
+
+    nodes: list[Any] = field(default_factory=list)
+    constants: list[Any] = field(default_factory=list)
+
+    def constant(self, name: str, value: Tensor | np.ndarray) -> str:
+        onnx: Any = require("onnx", extra="runtime")
+        array = value.detach().numpy() if isinstance(value, Tensor) else value
+        self.constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def node(self, operator: str, inputs: list[str], outputs: list[str], **attributes: Any) -> str:
+        onnx: Any = require("onnx", extra="runtime")
+        self.nodes.append(onnx.helper.make_node(operator, inputs, outputs, **attributes))
+        return outputs[0]
+
+    def dense(self, name: str, layer: nn.Linear, source: str) -> str:
+        weight, bias = self.constant(f"{name}.weight", layer.weight), self.constant(f"{name}.bias", layer.bias)
+        return self.node("Gemm", [source, weight, bias], [name], transB=1)
+
+    def model(self, name: str, inputs: dict[str, list[int]], outputs: dict[str, list[int]]) -> Any:
+        onnx: Any = require("onnx", extra="runtime")
+
+        def declared(shapes: dict[str, list[int]]) -> list[Any]:
+            kind = onnx.TensorProto.FLOAT
+            return [onnx.helper.make_tensor_value_info(key, kind, shape) for key, shape in shapes.items()]
+
+        graph = onnx.helper.make_graph(self.nodes, name, declared(inputs), declared(outputs), self.constants)
+        opsets = [onnx.helper.make_opsetid("", OPSET)]
+        model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=10, producer_name="garment-workbench")
+        onnx.checker.check_model(model)
+        return model
+
+
+def regressor_graph(regressor: Regressor) -> Any:
+    """The recurrent step: standardised inputs and hidden state -> latent and the next hidden state."""
+    graph, source, states = Graph(), "inputs", []
+    inputs = DESCRIPTOR_SIZE + regressor.shapes
+    split = [f"hidden_{layer}" for layer in range(LAYERS)]
+    graph.node("Split", ["hidden"], split, axis=0, num_outputs=LAYERS)
+    for layer in range(LAYERS):
+        weights = {
+            kind: _gates(getattr(regressor.gru, f"{name}_l{layer}"))
+            for kind, name in (("W", "weight_ih"), ("R", "weight_hh"), ("b", "bias_ih"), ("c", "bias_hh"))
+        }
+        names = [
+            graph.constant(f"W{layer}", weights["W"][None]),
+            graph.constant(f"R{layer}", weights["R"][None]),
+            graph.constant(f"B{layer}", torch.cat([weights["b"], weights["c"]])[None]),
+        ]
+        outputs = [f"out_{layer}", f"state_{layer}"]
+        graph.node("GRU", [source, *names, "", split[layer]], outputs, hidden_size=HIDDEN, linear_before_reset=1)
+        states.append(outputs[1])
+        source = graph.node(
+            "Squeeze", [outputs[0], graph.constant(f"axes{layer}", np.array([1]))], [f"sequence_{layer}"]
+        )
+    graph.node("Concat", states, ["next"], axis=0)
+    flat = graph.node("Reshape", [source, graph.constant("flat", np.array([1, HIDDEN]))], ["last_hidden"])
+    graph.node("Identity", [graph.dense("dense", regressor.last, flat)], ["latent"])
+    shapes = {"inputs": [1, 1, inputs], "hidden": [LAYERS, 1, HIDDEN]}
+    return graph.model("regressor", shapes, {"latent": [1, LATENTS], "next": [LAYERS, 1, HIDDEN]})
+
+
+def _gates(stacked: Tensor) -> Tensor:
+    parts = stacked.detach().chunk(3)
+    return torch.cat([parts[gate] for gate in GATES])
+
+
+def decoder_graph(subspace: Subspace) -> Any:
+    """latent (1,25) -> X (1,3N)."""
+    graph, source = Graph(), "latent"
+    for index, layer in enumerate(subspace.decoder.trunk.layers):
+        name = f"trunk_{index}"
+        if isinstance(layer, nn.Linear):
+            source = graph.dense(name, layer, source)
+        elif isinstance(layer, nn.ReLU):
+            source = graph.node("Relu", [source], [name])
+        else:
+            assert isinstance(layer, nn.LayerNorm)
+            scale, shift = graph.constant(f"{name}.scale", layer.weight), graph.constant(f"{name}.shift", layer.bias)
+            source = graph.node("LayerNormalization", [source, scale, shift], [name], axis=-1, epsilon=layer.eps)
+    decoder = subspace.decoder
+    if isinstance(decoder, Decoder):
+        amounts = graph.dense("amounts", decoder.amounts, source)
+        graph.node(
+            "Gemm", [amounts, graph.constant("basis", decoder.basis), graph.constant("mean", decoder.middle)], ["X"]
+        )
+    else:
+        assert isinstance(decoder, DenseDecoder)
+        last = graph.dense("last", decoder.last, source)
+        wide = graph.node("Mul", [last, graph.constant("spread", decoder.spread)], ["wide"])
+        graph.node("Add", [wide, graph.constant("mean", decoder.middle)], ["X"])
+    return graph.model("decoder", {"latent": [1, LATENTS]}, {"X": [1, 3 * subspace.vertex_count]})
+
+
+def write_onnx(folder: Path, regressor: Regressor, subspace: Subspace) -> list[Path]:
+    """regressor.onnx and decoder.onnx in the folder, each whole or not at all."""
+    written = []
+    for name, model in (("regressor", regressor_graph(regressor)), ("decoder", decoder_graph(subspace))):
+        path = folder / f"{subspace.garment_name}-{name}.onnx"
+        with atomic_write(path) as part:
+            part.write_bytes(model.SerializeToString())
+        written.append(path)
+    return written
+
+
+class OnnxNetworks:
+    """The same two networks in onnxruntime, on one thread (two are slower when anything else runs: facts.md 5)."""
+
+    def __init__(self, regressor: Regressor, subspace: Subspace):
+        onnxruntime: Any = require("onnxruntime", extra="runtime")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+
+        def session(model: Any) -> Any:
+            return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+        self.regressor, self.decoder = session(regressor_graph(regressor)), session(decoder_graph(subspace))
+
+    def regress(
+        self, inputs: Float[Tensor, "I"], hidden: Float[Tensor, "Y 1 H"]
+    ) -> tuple[Float[Tensor, "L"], Float[Tensor, "Y 1 H"]]:
+        given = {"inputs": inputs.numpy()[None, None], "hidden": hidden.numpy()}
+        latent, following = self.regressor.run(["latent", "next"], given)
+        return torch.from_numpy(latent)[0], torch.from_numpy(following)
+
+    def decode(self, latent: Float[Tensor, "L"]) -> Float[Tensor, "N 3"]:
+        return torch.from_numpy(self.decoder.run(["X"], {"latent": latent.numpy()[None]})[0]).reshape(-1, 3)
