@@ -1,12 +1,17 @@
 """Scans of simulated clothes: only the outside, evenly, where it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 import trimesh
 
-from assets_gen.scans import scan_surfaces, sphere_directions
+from assets_gen.scans import ScansConfig, run, scan_sequence, scan_surfaces, sphere_directions
+from workbench.collisions.sequences import SHIPPED, SimulatedSequence
 from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
+from workbench.points.uv_position_map import pelvis_frame, posed_bodies
 
 
 def arrays(mesh):
@@ -76,6 +81,30 @@ def test_points_lie_on_the_surfaces_with_their_normals(body, rng):
     belly = np.abs(scan.points.numpy() - [0, -0.12, 1.1]).max(1) < 0.08
     assert belly.sum() > 50
     assert cloth[belly].all()
+
+
+def test_scans_of_a_sequence_stand_in_the_pelvis_frame(body):
+    """Each point lies on the simulated cloth or on the posed body, both carried into the pelvis frame."""
+    sequence = SimulatedSequence.load(SHIPPED / "tshirt_walk.npz").clip(0, 20)
+    scans = scan_sequence(sequence, body, ScansConfig(points=1500, stride=10))
+    assert (len(scans), scans.outfit, scans.fps) == (2, "tshirt", 3.0)
+    bodies = posed_bodies(body, scans.rotations, scans.betas)
+    frame = pelvis_frame(body, sequence.rotations[10], sequence.betas, sequence.translation[10])
+    scan = scans.frame(1).points.numpy()
+    surfaces = [(bodies.vertices[1], body.faces), (frame.to_local(sequence.garment[10]), sequence.faces)]
+    distance = [ClosestPoint(v.numpy(), f.numpy()).query(scan).distance for v, f in surfaces]
+    assert np.minimum(*distance).max() < 1e-4
+    assert (distance[1] < 1e-4).mean() > 0.2
+
+
+def test_what_cannot_be_scanned_is_named(tmp_path, body):
+    with pytest.raises(ValueError, match=r"no simulated sequence \*.npz in"):
+        run(ScansConfig(sequences=tmp_path))
+    with pytest.raises(ValueError, match="no simulated sequence nobody in"):
+        run(ScansConfig(only=("nobody",)))
+    sequence = SimulatedSequence.load(SHIPPED / "tshirt_walk.npz").clip(0, 2)
+    with pytest.raises(ValueError, match="no frame of tshirt on .* was kept"):
+        scan_sequence(replace(sequence, valid=torch.zeros(2, dtype=torch.bool)), body, ScansConfig())
 
 
 def test_meshes_that_are_inside_out_are_refused(rng):

@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from workbench.geometry.mesh import vertex_normals
+from workbench.points.clothed_points import ClothedPoints
 from workbench.points.dressing import Dresser
-from workbench.points.evaluation import CloudError, cloud_error, dress_every_pixel, statistics
-from workbench.points.scans import ScanFrame
+from workbench.points.evaluation import CloudError, cloud_error, dress_every_pixel, errors_on, statistics
+from workbench.points.scans import ScanFrame, ScanSequence
+from workbench.points.training import ScanSet
 from workbench.points.uv_position_map import atlas_of, posed_bodies
 
 
@@ -30,6 +33,27 @@ def test_columns_of_the_table():
     assert column.outfit_max == 9.0
     with pytest.raises(ValueError, match="no clouds"):
         statistics([], lambda error: error.chamfer)
+
+
+def test_every_frame_is_judged_against_its_own_scan(body):
+    """Clouds that are the scans have no error; clouds of the bare body have that of the gap."""
+    rotations = body.rest_rotations().repeat(2, 1, 1, 1)
+    vertices = posed_bodies(body, rotations, body.mean_shape()).vertices
+    normals = vertex_normals(vertices, body.faces)
+    frames = [ScanFrame(v + 0.005 * n, n) for v, n in zip(vertices, normals, strict=True)]
+    sequence = ScanSequence.of(
+        frames, outfit="thick", motion="m", rotations=rotations, betas=body.mean_shape(), fps=30.0
+    )
+    scans = ScanSet.of(body, [sequence], input_size=32)
+
+    def cloud_of(points, normals):
+        return ClothedPoints(points[None], normals[None], torch.zeros_like(points)[None])
+
+    exact = errors_on(scans, lambda batch: cloud_of(batch.scans[0].points, batch.scans[0].normals))
+    bare = errors_on(scans, lambda batch: cloud_of(batch.bodies.vertices[0], batch.scans[0].normals))
+    assert len(exact) == len(bare) == 2
+    assert all(error.chamfer == 0 and error.outfit == "thick" for error in exact)
+    assert all(error.plane == pytest.approx(25e-6, rel=0.2) for error in bare)
 
 
 def test_both_ways_give_the_same_points(body, small_model, trained_like):

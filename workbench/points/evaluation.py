@@ -20,6 +20,7 @@ from workbench.points.dressing import Dresser
 from workbench.points.losses import normal_loss
 from workbench.points.scans import ScanFrame
 from workbench.points.shape_decoder import CanonicalClothes
+from workbench.points.training import Batch, ScanSet
 from workbench.points.uv_position_map import (
     INPUT_SIZE,
     QUERY_SIZE,
@@ -74,6 +75,18 @@ def statistics(errors: Sequence[CloudError], value: Callable[[CloudError], float
         outfit_median=float(np.median(means)),
         outfit_max=max(means),
     )
+
+
+@torch.no_grad()
+def errors_on(scans: ScanSet, dress: Callable[[Batch], ClothedPoints]) -> list[CloudError]:
+    """The error of every frame of a set; `dress` makes the clouds, whatever the method (one frame a batch)."""
+    errors = []
+    for i in range(len(scans)):
+        batch = scans.batch([i])
+        cloud = dress(batch)
+        outfit = scans.outfits[int(batch.outfit[0])]
+        errors.append(cloud_error(cloud.points[0], cloud.normals[0], batch.scans[0], outfit))
+    return errors
 
 
 # Speed: the same weights, the published way and ours
