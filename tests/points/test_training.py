@@ -102,6 +102,16 @@ def test_a_killed_run_ends_where_the_uninterrupted_one_does(scans, small_model, 
         assert torch.equal(tensor, resumed.state_dict()[name]), name
 
 
+def test_half_precision_learns_alike(scans, small_model):
+    """The first losses agree to a few percent, and stay finite: the networks' rounding is small against the loss."""
+    runs: dict[str, list[float]] = {"float32": [], "bfloat16": []}
+    for precision, losses in runs.items():
+        model = fresh(small_model)
+        config = config_of(model, steps=4, precision=precision)
+        train_points(model, scans, config, watch=lambda _, loss, losses=losses: losses.append(loss))
+    assert runs["bfloat16"] == pytest.approx(runs["float32"], rel=0.05)
+
+
 def test_what_is_stored_is_what_was_trained(scans, small_model, trained_like, tmp_path, body):
     trained = TrainedPoints(trained_like(fresh(small_model)), scans.outfits)
     trained.save(tmp_path / "m.safetensors", body)
