@@ -27,9 +27,16 @@ OURS = ("workbench", "widgets", "assets_gen")
 EVALUATIONS = {
     "fields": ("workbench.collisions.field_evaluation", "FieldEvaluation"),
     "projection": ("workbench.collisions.projection_evaluation", "ProjectionEvaluation"),
+    "subspace": ("workbench.collisions.subspace_evaluation", "SubspaceEvaluation"),
+    "collisions": ("workbench.collisions.collision_evaluation", "CollisionEvaluation"),
+    "runtime": ("workbench.collisions.runtime_evaluation", "RuntimeEvaluation"),
 }
 # `workbench train STAGE`: where its config class and its `run(config)` are
-TRAININGS = {"fields": ("workbench.collisions.field_training", "TrainFieldsConfig")}
+TRAININGS = {
+    "fields": ("workbench.collisions.field_training", "TrainFieldsConfig"),
+    "subspace": ("workbench.collisions.subspace", "TrainSubspaceConfig"),
+    "regressor": ("workbench.collisions.regressor", "TrainRegressorConfig"),
+}
 
 
 class Unusable(Exception):
@@ -88,6 +95,24 @@ def demo(words: list[str]) -> int:
     return DONE
 
 
+def tryon(words: list[str]) -> int:
+    from workbench.collisions.tryon import TryOnConfig, run
+
+    config = parsed(TryOnConfig, "workbench tryon", words)
+    result = run(config)
+    say(f"written: {config.out} ({len(result.latent)} frames of {result.garment.shape[1]} vertices)")
+    return DONE
+
+
+def inspect(words: list[str]) -> int:
+    from workbench.inspector import InspectConfig, run
+
+    config = parsed(InspectConfig, "workbench inspect", words)
+    run(config, page=plugged_in("workbench.pages", "inspect"))
+    say(f"written: {', '.join(str(config.out / name) for name in ('report.json', 'report.html'))}")
+    return DONE
+
+
 def evaluate(words: list[str]) -> int:
     name, rest = choice("workbench evaluate", "NAME", EVALUATIONS, words)
     module_name, config_name = EVALUATIONS[name]
@@ -143,8 +168,16 @@ COMMANDS = {
     "demo": Command(
         demo, "[--out DIR]", "simulated cloth to canonical space and back on another body: .glb, .png, report"
     ),
-    "evaluate": Command(evaluate, "fields|projection [--json FILE]", "the figures of a stage, with their bounds"),
-    "train": Command(train, "fields", "train a stage; a run that was ended continues"),
+    "tryon": Command(
+        tryon, "GARMENT --motion FILE --out FILE.npz", "dress a body in a garment through any motion file"
+    ),
+    "inspect": Command(
+        inspect, "BODY [GARMENT] --out DIR", "collisions of any mesh sequences: when, where, how deep; .json and .html"
+    ),
+    "evaluate": Command(
+        evaluate, f"{'|'.join(EVALUATIONS)} [--json FILE]", "the figures of a stage, with their bounds"
+    ),
+    "train": Command(train, "|".join(TRAININGS), "train a stage; a run that was ended continues"),
     "export": Command(export, "SEQUENCE.npz --out PATH", "a sequence as .glb, .npz, OBJ, PLY or PC2"),
     "doctor": Command(doctor, "", "what this machine has and lacks, with the command that mends it"),
 }

@@ -51,7 +51,7 @@ def test_gamma_is_blind_to_where_the_body_stands_and_faces(angle):
 
 
 def test_gamma_sees_a_body_that_leans():
-    rotations, translation = motion()
+    rotations, _ = motion()
     leaning = rotations.clone()
     leaning[:, 0] = axis_angle_to_matrix(torch.tensor([0.6, 0.0, 0.0])) @ rotations[:, 0]
     assert (pose_input(leaning) - pose_input(rotations)).abs().max() > 0.1

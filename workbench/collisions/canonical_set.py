@@ -38,7 +38,7 @@ class CanonicalSequence:
     betas: Float[Tensor, " K"]
     valid: Bool[Tensor, " _"]  # the simulation kept the frame
     motion_name: str
-    split: str  # train, validation or test
+    split: str  # train or validation; test sequences ship exactly (SimulatedSequence)
 
     def __len__(self) -> int:
         return len(self.coefficients)
@@ -162,16 +162,16 @@ class Projected:
 def compact(
     projected: Sequence[Projected], garment_name: str, fps: float, *, rank: int, generator: torch.Generator
 ) -> CanonicalSet:
-    """Mean and principal components of the kept training frames; coefficients of all frames.
+    """Mean and principal components of all kept frames given (training and validation, never test); coefficients.
 
-    Errors: ValueError for no kept training frame, or sequences of different vertex counts.
+    Errors: ValueError for no kept frame, or sequences of different vertex counts.
     """
     counts = {one.canonical.shape[1] for one in projected}
     if len(counts) != 1:
         raise ValueError(f"all sequences must be of one garment; got vertex counts {sorted(counts)}")
-    kept = [one.canonical[one.sequence.valid] for one in projected if one.sequence.split == "train"]
+    kept = [one.canonical[one.sequence.valid] for one in projected]
     if not sum(map(len, kept)):
-        raise ValueError("no training frame was kept: there is nothing to make a basis of")
+        raise ValueError("no frame was kept: there is nothing to make a basis of")
     frames = torch.cat(kept)
     mean = frames.mean(dim=0)
     basis = principal_components((frames - mean).flatten(1), rank, generator).unflatten(1, (-1, 3))

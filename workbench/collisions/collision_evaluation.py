@@ -17,12 +17,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from workbench.body.model import Body
-from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.penetration import penetration
 from workbench.collisions.regressor import Regressor
-from workbench.collisions.subspace import SHIPPED, Subspace, garment_faces
+from workbench.collisions.sequences import SimulatedSequence, shipped_tests
+from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.collisions.subspace_evaluation import trained_garments, wrinkles
 from workbench.collisions.tryon import TryOn
 from workbench.evaluation_table import Row, at_least, at_most, told, within
@@ -176,17 +176,17 @@ def count(tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], every: int) -> Co
 def fidelity_rows(name: str, tryon: TryOn) -> list[Row]:
     """Against simulation on the unseen test sequences: error, gap and wrinkles (collisions must not be won by
     inflating or ironing the garment)."""
-    data = CanonicalSet.shipped(name)
-    laplacian = umbrella_laplacian(garment_faces(data), len(data.mean))
+    laplacian = umbrella_laplacian(tryon.garment.faces, len(tryon.garment.vertices))
     sums = np.zeros(7)
-    for s in data.of_split("test"):
+    for s in shipped_tests(name):
         index = torch.arange(0, len(s), 6)
         index = index[s.valid[index]]
         if len(index):
-            sums += len(index) * _compared(tryon, data, s, index, laplacian)
-    frames, error, skinned, gap, wanted_gap, folds, wanted_folds = (
-        sums / max(sums[0], 1.0) * np.array([sums[0], *[1] * 6])
-    )
+            sums += len(index) * _compared(tryon, s, index, laplacian)
+    frames = sums[0]
+    if not frames:
+        raise ValueError(f"no test sequence of garment {name!r} ships; make some: python -m assets_gen dataset --ship")
+    error, skinned, gap, wanted_gap, folds, wanted_folds = sums[1:] / frames
     return [
         told(f"{name}: frames compared with simulation", frames, "frames"),
         told(f"{name}: vertex error on unseen sequences, mean", MILLI * error, "mm"),
@@ -197,16 +197,14 @@ def fidelity_rows(name: str, tryon: TryOn) -> list[Row]:
     ]
 
 
-def _compared(
-    tryon: TryOn, data: CanonicalSet, s: CanonicalSequence, index: Tensor, laplacian: Float[Tensor, "N N"]
-) -> np.ndarray:
+def _compared(tryon: TryOn, s: SimulatedSequence, index: Tensor, laplacian: Float[Tensor, "N N"]) -> np.ndarray:
     """Means over frames: 1, error, error of the template, gap, simulation's gap, folds, simulation's folds."""
     model = tryon.model
     latent = tryon.regressor(s.rotations[None], s.translation[None], s.betas[None])[0][index]
     state = model.state(s.rotations[index], s.betas, s.translation[index])
     bodies = model.body.vertices(s.rotations[index], s.betas, s.translation[index])
     found = model.posed(tryon.subspace.decode(latent), state)
-    wanted = model.posed(data.garments(s.coefficients[index]), state)
+    wanted = s.garment[index]
     template = model.posed(tryon.garment.vertices.expand(len(index), -1, -1).contiguous(), state)
     return np.array(
         [

@@ -353,7 +353,7 @@ def levenberg_marquardt(
         chosen = active[better]
         X[chosen], residual[chosen], jacobian[chosen] = trial[better], miss[better], J[better]
         best[chosen] = miss[better].norm(dim=-1)
-        damping[active] = torch.where(better, damping[active] / 5, damping[active] * 8).clamp(1e-8, 1e4)
+        damping[active] = torch.where(better, damping[active] / 5, damping[active] * 8).clamp(1e-6, 1e4)
         active = active[best[active] > config.tolerance]
     return X, best
 

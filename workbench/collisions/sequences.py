@@ -25,6 +25,7 @@ STORAGE_STEP = 3e-5  # metres; the stored error is at most half of it (the contr
 FORMAT = "simulated-sequence-1"
 STORED = ("format", "step", "residual", "rotations", "translation", "betas", "faces", "valid", "fps", "names")
 SHIPPED = Path(__file__).parents[1] / "assets" / "sequences"
+SHIPPED_TESTS = SHIPPED.with_name("test_sequences")  # of motions and shapes that no training saw
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +123,11 @@ class SimulatedSequence:
 def shipped_sequences() -> list[SimulatedSequence]:
     """Every simulated sequence that ships, by file name."""
     return [SimulatedSequence.load(path) for path in sorted(SHIPPED.glob("*.npz"))]
+
+
+def shipped_tests(garment_name: str) -> list[SimulatedSequence]:
+    """The simulated test sequences of a garment that ship, by file name; motions and shapes that no training saw."""
+    return [SimulatedSequence.load(path) for path in sorted(SHIPPED_TESTS.glob(f"{garment_name}_*.npz"))]
 
 
 def shipped_sequence(name: str) -> SimulatedSequence:

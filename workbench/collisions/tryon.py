@@ -5,10 +5,10 @@ or in onnxruntime (`with_onnx`); the fields come from the table, or from the pap
 """
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -62,18 +62,20 @@ class TryOnResult:
             np.savez(part, **arrays)
 
 
-class Networks(Protocol):
+class Networks(ABC):
     """One step of the regressor and the decoder: all that a stream needs of a runtime."""
 
+    @abstractmethod
     def regress(
         self, inputs: Float[Tensor, "I"], hidden: Float[Tensor, "Y 1 H"]
     ) -> tuple[Float[Tensor, "L"], Float[Tensor, "Y 1 H"]]: ...
 
+    @abstractmethod
     def decode(self, latent: Float[Tensor, "L"]) -> Float[Tensor, "N 3"]: ...
 
 
 @dataclass(frozen=True, eq=False)
-class TorchNetworks:
+class TorchNetworks(Networks):
     """The networks as they were trained."""
 
     regressor: Regressor

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from workbench.collisions.motion_descriptor import DESCRIPTOR_SIZE
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, DenseDecoder, Subspace
+from workbench.collisions.tryon import Networks
 from workbench.extras import require
 from workbench.store import atomic_write
 
@@ -108,7 +109,10 @@ def decoder_graph(subspace: Subspace) -> Any:
             source = graph.node("LayerNormalization", [source, scale, shift], [name], axis=-1, epsilon=layer.eps)
     decoder = subspace.decoder
     if isinstance(decoder, Decoder):
-        amounts = graph.dense("amounts", decoder.amounts, source)
+        learned = graph.dense("learned", decoder.amounts, source)
+        beyond = decoder.amounts.out_features - LATENTS
+        pads = graph.constant("pads", np.array([0, 0, 0, beyond]))
+        amounts = graph.node("Add", [learned, graph.node("Pad", ["latent", pads], ["leading"])], ["amounts"])
         graph.node(
             "Gemm", [amounts, graph.constant("basis", decoder.basis), graph.constant("mean", decoder.middle)], ["X"]
         )
@@ -131,7 +135,7 @@ def write_onnx(folder: Path, regressor: Regressor, subspace: Subspace) -> list[P
     return written
 
 
-class OnnxNetworks:
+class OnnxNetworks(Networks):
     """The same two networks in onnxruntime, on one thread (two are slower when anything else runs: facts.md 5)."""
 
     def __init__(self, regressor: Regressor, subspace: Subspace):
