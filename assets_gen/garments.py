@@ -73,7 +73,7 @@ class LowerOutfit:
     hem: float
     flare: float  # the hem is 1 + flare times as wide as the cut; negative: legs that narrow
     legs: int  # 2; a skirt has 1
-    belt: float = 0.08  # share of the waist by which its material is shorter: it holds the garment
+    belt: float = 0.22  # share of the waist by which its material is shorter: it holds the garment
     gap_waist: float = 0.005  # wanted distance to the body at the waistband ...
     gap_leg: float = 0.012  # ... and from the hip joint down
     smoothing: int = 60  # steps
@@ -105,7 +105,7 @@ OUTFITS: dict[str, Outfit | LowerOutfit] = {
     ),
     "longsleeve": Outfit(
         "longsleeve",
-        sleeve=1.66,
+        sleeve=1.72,
         neck_height=-0.004,
         neck_tilt=0.36,
         cut=0.12,
@@ -127,7 +127,7 @@ OUTFITS: dict[str, Outfit | LowerOutfit] = {
         gap_belly=0.030,
         gap_sleeve=0.006,
     ),
-    "trousers": LowerOutfit("trousers", top=0.15, cut=-0.16, hem=-0.74, flare=-0.28, legs=2),
+    "trousers": LowerOutfit("trousers", top=0.15, cut=-0.16, hem=-0.74, flare=-0.28, legs=2, belt=0.3),
     "shorts": LowerOutfit("shorts", top=0.15, cut=-0.16, hem=-0.30, flare=0.08, legs=2),
     "skirt": LowerOutfit("skirt", top=0.16, cut=0.06, hem=-0.38, flare=0.55, legs=1),
 }
@@ -395,10 +395,12 @@ def _extrude(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rings of quads from the lowest boundary loops down to the hem, widening by the flare, along the legs if two."""
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    loops = [loop.numpy() for loop in boundary_loops(torch.from_numpy(triangles))]
+    # a long sleeve may end lower than the tights were cut
+    middle = [loop.numpy() for loop in boundary_loops(torch.from_numpy(triangles))]
+    middle = [loop for loop in middle if abs(vertices[loop, 0].mean()) < at.shoulder[0]]
     hem = at.hip[2] + outfit.hem
     all_vertices, all_quads, count = [vertices], [quads], len(vertices)
-    for loop in sorted(loops, key=lambda chain: vertices[chain, 2].mean())[:legs]:
+    for loop in sorted(middle, key=lambda chain: vertices[chain, 2].mean())[:legs]:
         top = vertices[loop]
         centre = (top.min(0) + top.max(0)) / 2
         rings, above = max(1, round((top[:, 2].mean() - hem) / RING)), loop
