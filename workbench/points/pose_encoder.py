@@ -46,7 +46,7 @@ class PoseEncoder(nn.Module):
             up = _SmoothUp if level < SMOOTH_LEVELS else _TransposedUp
             self.up.append(up(inputs, outputs, last=level == 0))
         _initialise(self, generator)
-        self.to(memory_format=torch.channels_last)  # with bfloat16, 222 ms a step against 400 (facts.md 2)
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  with bfloat16, 222 ms a step against 400 (facts.md 2)
 
     def forward(self, position_map: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B c H W"]:
         """Raises ValueError where the map cannot be halved `depth` times."""
