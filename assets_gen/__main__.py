@@ -20,6 +20,7 @@ MAKERS = {
     "simulations": ("assets_gen.simulations", "SimulationsConfig"),
     "scans": ("assets_gen.scans", "ScansConfig"),
     "dataset": ("assets_gen.dataset", "DatasetConfig"),
+    "models": ("assets_gen.models", "ModelsConfig"),
 }
 
 

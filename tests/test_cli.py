@@ -104,7 +104,10 @@ def test_import_is_light_and_public_names_resolve():
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["fly"], "workbench: there is no command 'fly': workbench has demo, evaluate, train, export, doctor"),
+        (
+            ["fly"],
+            "workbench: there is no command 'fly': workbench has demo, tryon, inspect, evaluate, train, export, doctor",
+        ),
         (["evaluate"], "workbench: workbench evaluate needs a NAME, one of fields, projection; got nothing"),
         (["train", "cats"], "workbench: workbench train needs a STAGE, one of fields; got 'cats'"),
         (["doctor", "--fast"], "workbench: workbench doctor takes no options, got '--fast'"),

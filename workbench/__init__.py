@@ -14,8 +14,14 @@ The map
 | body SDF            | 4.3     | 12   | workbench.collisions.body_sdf    | p (N,3) -> distance (N,)             |
 | garment model       | 4.2     | 7-8  | workbench.collisions.garment_model | X, beta, theta -> M_G              |
 | projection          | 4.3     | 9-12 | workbench.collisions.projection  | M_G, beta, theta -> X                |
+| training set        | 4.4     |      | workbench.collisions.canonical_set | X (T,N,3) of many sequences <-> file |
+| subspace            | 4.4     | 13-16 | workbench.collisions.subspace   | X -> x_bar (25) -> X                 |
+| motion descriptor   | 5       | 17   | workbench.collisions.motion_descriptor | theta, H, K -> gamma (42)      |
+| posed collisions    |         |      | workbench.collisions.posed_collision | X, beta, theta -> hinge of depth |
+| regressor           | 5       | 1, 18 | workbench.collisions.regressor  | beta, gamma -> x_bar (T,25)          |
+| try-on              | 5-6     |      | workbench.collisions.tryon       | beta, motion -> posed garment        |
 | penetration         | 4.3, 6  |      | workbench.collisions.penetration | mesh, body -> vertices inside, depth |
-| demo                |         |      | workbench.demo                   | simulated -> canonical -> re-posed   |
+| demo                |         |      | workbench.tryon_demo             | try-on -> page, GLB, picture, report |
 
 Paper 2: Ma, Yang, Tang, Black, "The Power of Points for Modeling Humans in Clothing" (POP), ICCV 2021.
 | stage               | section | eq.  | module                             | in -> out                          |
@@ -70,6 +76,10 @@ _HOME_OF = {
     "MonteCarloFields": "workbench.collisions.diffused_body",
     "LearnedFields": "workbench.collisions.diffused_body",
     "GridFields": "workbench.collisions.diffused_body",
+    "CanonicalSet": "workbench.collisions.canonical_set",
+    "Subspace": "workbench.collisions.subspace",
+    "Regressor": "workbench.collisions.regressor",
+    "TryOn": "workbench.collisions.tryon",
     "Store": "workbench.store",
     "atomic_write": "workbench.store",
     "MeshSequence": "workbench.formats.mesh_sequence",

@@ -86,11 +86,10 @@ def is_unusable_input(error: BaseException) -> bool:
 
 
 def demo(words: list[str]) -> int:
-    from workbench.demo import DemoConfig, run
+    from workbench.tryon_demo import TryOnDemoConfig, run
 
-    config = parsed(DemoConfig, "workbench demo", words)
-    picture = plugged_in("workbench.pictures", "demo")
-    run(config, picture=picture)
+    config = parsed(TryOnDemoConfig, "workbench demo", words)
+    run(config, picture=plugged_in("workbench.pictures", "tryon"), page=plugged_in("workbench.pages", "tryon"))
     say(f"written: {', '.join(str(path) for path in sorted(config.out.glob('*')))}")
     return DONE
 
@@ -165,9 +164,7 @@ class Command:
 
 
 COMMANDS = {
-    "demo": Command(
-        demo, "[--out DIR]", "simulated cloth to canonical space and back on another body: .glb, .png, report"
-    ),
+    "demo": Command(demo, "[--out DIR]", "dress a body and a motion that no training saw: .html, .glb, .png, report"),
     "tryon": Command(
         tryon, "GARMENT --motion FILE --out FILE.npz", "dress a body in a garment through any motion file"
     ),

@@ -17,9 +17,13 @@ from torch import Tensor
 
 from workbench.collisions.garment_model import GarmentModel
 from workbench.geometry.closest_point import ClosestPoint
+from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.winding import InsideTest
 
 MILLI = 1e3
+SURELY_OUTSIDE = (
+    0.5  # cosine between the way to a point and the surface normal there: above it no winding number is asked
+)
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,18 @@ class PosedCollision:
         """Signed distance to each body, differentiable in the points; beyond `reach` it says `reach`, constant."""
         values = torch.full(posed.shape[:-1], self.reach)
         directions = torch.zeros_like(posed)
+        faces = self.model.body.faces
+        normals = torch.stack([vertex_normals(surface, faces) for surface in bodies]).numpy()
         for frame, (points, surface) in enumerate(zip(posed.detach().numpy(), bodies.numpy(), strict=True)):
             self._closest.refit(surface)
             hit = self._closest.query(points)
             near = np.flatnonzero(hit.distance < self.reach)
-            self._inside.refit(surface)
-            sign = np.where(self._inside(points[near]), -1.0, 1.0).astype(np.float32)
             away = (points[near] - hit.point[near]) / np.maximum(hit.distance[near, None], 1e-7)
-            values[frame, near] = torch.from_numpy(sign * hit.distance[near])
-            directions[frame, near] = torch.from_numpy(sign[:, None] * away)
+            outward = hit.interpolate(normals[frame], faces.numpy())[near]
+            doubtful = near[(away * outward).sum(-1) < SURELY_OUTSIDE]
+            self._inside.refit(surface)
+            sign = np.ones(len(points), np.float32)
+            sign[doubtful[self._inside(points[doubtful])]] = -1.0
+            values[frame, near] = torch.from_numpy(sign[near] * hit.distance[near])
+            directions[frame, near] = torch.from_numpy(sign[near, None] * away)
         return values + (directions * (posed - posed.detach())).sum(-1)

@@ -40,6 +40,7 @@ class ProjectionEvaluation:
     sequences: Path | None = None  # folder of simulated sequences (.npz); default: those that ship
     motions: Path | None = None  # folder of motion files for the floor; default: those that ship
     ablation_frames: int = 30  # of each sequence, from its beginning
+    floor_motions: int = 6  # about so many of the motions, spread evenly
     floor_shapes: int = 2  # random shapes, each with every motion
     floor_frames: int = 60  # of each motion, from its beginning
     floor_every: int = 4  # frames: one in so many is posed and counted
@@ -262,4 +263,5 @@ def _sequences(config: ProjectionEvaluation) -> Iterator[SimulatedSequence]:
 
 
 def _motions(config: ProjectionEvaluation, body: Body) -> Iterable[Motion]:
-    return [load_motion(file, body) for file in motion_files(config.motions)]
+    files = motion_files(config.motions)
+    return [load_motion(file, body) for file in files[:: max(1, len(files) // config.floor_motions)]]

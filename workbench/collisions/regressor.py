@@ -60,13 +60,15 @@ class TrainRegressorConfig:
     data: Path | None = None
     # The folder with GARMENT-subspace.safetensors, also written to.
     out: Path = Path("out/models")
+    # Goes into the file names, for variants such as ".paper" (Tab. 1) beside the full model.
+    suffix: str = ""
     weights: RegressorWeights = RegressorWeights(posed=3.0)
     window: int = 40  # frames
     batch: int = 16  # windows a step
     posed_every: int = 2  # steps between two with the posed term
     posed_frames: int = 8  # frames a step that are posed, each from a random motion on a random shape
     describe: FitConfig = field(default_factory=lambda: FitConfig(steps=1500, learning_rate=2e-3))
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=4000, learning_rate=1e-3))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=2500, learning_rate=1e-3))
     watch_every: int = 500
     seed: int = 0
 
@@ -316,7 +318,7 @@ def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
 def run(config: TrainRegressorConfig) -> Regressor:
     """Train (or continue), write `out`/GARMENT-regressor.safetensors with its curves, return it."""
     training = RegressorTraining.of(config)
-    name = training.data.garment_name
+    name = f"{training.data.garment_name}{config.suffix}"
     work = config.out / "work" / f"{name}-regressor"
     described = fit_descriptor(training, work)
     regressor = training.regressor

@@ -50,8 +50,8 @@ class LossWeights:
     """Eq. 13, terms in millimetres.  The paper leaves all open; ours, measured on the validation sequences."""
 
     laplacian: float = 1.0  # lambda_1
-    collision: float = 20.0  # lambda_2
-    kl: float = 4e-3  # lambda_3
+    collision: float = 50.0  # lambda_2
+    kl: float = 0.2  # lambda_3; a tenth of it remembers the training sequences
     self_supervised: bool = True  # the second term of Eq. 16
     clearance: float = 2e-3  # epsilon of Eq. 16, metres
 
@@ -68,7 +68,7 @@ class TrainSubspaceConfig:
     weights: LossWeights = LossWeights()
     batch: int = 32  # training frames a step
     random_batch: int = 32  # latents drawn from N(0, I) a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=12_000, learning_rate=1e-3, checkpoint_every=500))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=6000, learning_rate=1e-3, checkpoint_every=500))
     watch_every: int = 500  # steps between two points of the curves (Fig. 4)
     seed: int = 0
 
