@@ -8,6 +8,7 @@ import torch
 
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import ExactSDF, GridSDF, GridSDFConfig, LearnedSDF
+from workbench.garments import Garment
 from workbench.geometry.field_grid import GridConfig
 from workbench.geometry.sampling import sample_shell, sample_surface
 
@@ -60,6 +61,22 @@ def test_the_table_meets_its_bounds(exact, grid, near, samples):
         there = truth / offset > 0.9
         wrong = (grid(points) > 0) != (truth > 0)
         assert wrong[there].float().mean() <= allowed
+
+
+def test_the_network_that_ships_is_no_worse_than_the_published_one_on_skin_and_tshirt(body, exact, samples):
+    learned = LearnedSDF.default()
+    surface = torch.from_numpy(samples.point)
+    with torch.no_grad():
+        found = learned(surface).abs()
+        assert found.mean() < 1e-3
+        assert found.quantile(0.95) < 3.5e-3
+        points = Garment.load("tshirt").vertices
+        assert (learned(points) - exact(points)).abs().mean() < 0.25e-3
+        for offset, allowed in ((1e-3, 0.084), (-5e-3, 0.118)):
+            points = surface + offset * torch.from_numpy(samples.normal)
+            truth = exact(points)
+            there = truth / offset > 0.9
+            assert ((learned(points) > 0) != (truth > 0))[there].float().mean() <= allowed
 
 
 def test_beyond_the_box_the_distance_keeps_growing(grid):
