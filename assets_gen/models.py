@@ -10,6 +10,7 @@ from workbench.collisions.regressor import RegressorWeights, TrainRegressorConfi
 from workbench.collisions.regressor import run as train_regressor
 from workbench.collisions.subspace import TrainSubspaceConfig
 from workbench.collisions.subspace import run as train_subspace
+from workbench.learning.fit import FitConfig
 from workbench.store import add_to_manifest, code_version
 
 CODE = (
@@ -31,15 +32,23 @@ class ModelsConfig:
     work: Path = Path("out/models")  # where training keeps its state
     subspace: TrainSubspaceConfig = TrainSubspaceConfig()
     regressor: TrainRegressorConfig = TrainRegressorConfig()
+    # the full model starts from the paper's and learns the posed-space term
+    refine: FitConfig = FitConfig(steps=1000, learning_rate=3e-4)
 
 
 def run(config: ModelsConfig) -> None:
     """Write GARMENT-subspace, GARMENT-regressor and GARMENT.paper-regressor.safetensors, and their manifest entries."""
     subspace = train_subspace(replace(config.subspace, garment=config.garment, out=config.work))
     _record(config, f"{config.garment}-subspace.safetensors", subspace.story)
-    full = replace(config.regressor, garment=config.garment, out=config.work)
-    paper = replace(full, suffix=PAPER, weights=replace(RegressorWeights(), posed=0.0))
-    for variant in (full, paper):
+    paper = replace(config.regressor, garment=config.garment, out=config.work, suffix=PAPER, weights=RegressorWeights())
+    full = replace(
+        paper,
+        suffix="",
+        start=config.work / f"{config.garment}{PAPER}-regressor.safetensors",
+        weights=config.regressor.weights,
+        fit=config.refine,
+    )
+    for variant in (paper, full):
         regressor = train_regressor(variant)
         _record(config, f"{config.garment}{variant.suffix}-regressor.safetensors", regressor.story)
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.penetration import penetration

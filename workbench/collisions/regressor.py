@@ -48,6 +48,8 @@ class RegressorWeights:
     velocity: float = 1.0  # rho_1, a frame
     acceleration: float = 0.5  # rho_2, a frame squared
     posed: float = 0.0  # mean hinge in posed space, millimetres (beyond the paper)
+    anchor: float = 1.0  # of the posed term: how near a random shape's latents stay to the true shape's; without it the
+    # garment swells on shapes that no training saw (vertex error on validation 33 mm instead of 20)
     clearance: float = 2e-3  # metres, of the posed term
 
 
@@ -62,6 +64,8 @@ class TrainRegressorConfig:
     out: Path = Path("out/models")
     # Goes into the file names, for variants such as ".paper" (Tab. 1) beside the full model.
     suffix: str = ""
+    # A trained regressor to start from; its descriptor is kept.
+    start: Path | None = None
     weights: RegressorWeights = RegressorWeights(posed=3.0)
     window: int = 40  # frames
     batch: int = 16  # windows a step
@@ -259,20 +263,23 @@ class RegressorTraining:
         return position_loss(*given) + w.velocity * velocity_loss(*given) + w.acceleration * acceleration_loss(*given)
 
     def unsupervised(self, generator: torch.Generator) -> Float[Tensor, ""]:
-        """The posed term: random training motions on random shapes; one frame of each."""
+        """The posed term: random training motions on random shapes; one frame of each; and the anchor."""
         count, length = self.config.posed_frames, self.config.window // 2
         batch = self.windows("train", count, length, generator)
         betas = torch.randn(batch.betas.shape, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT)
         found = self.regressor(batch.rotations, batch.translation, betas)
+        with torch.no_grad():
+            own = self.regressor(batch.rotations, batch.translation, batch.betas)
         frame = torch.randint(length // 2, length, (count,), generator=generator)
         pick = torch.arange(count)
         X = self.subspace.decode(found[pick, frame])
-        return self.posed(X, batch.rotations[pick, frame], betas)
+        w = self.config.weights
+        return w.posed * self.posed(X, batch.rotations[pick, frame], betas) + w.anchor * (found - own).abs().mean()
 
     def step(self, step: int, generator: torch.Generator) -> Float[Tensor, ""]:
         loss = self.supervised(generator)
         if self.config.weights.posed and step % self.config.posed_every == 0:
-            loss = loss + self.config.weights.posed * self.unsupervised(generator)
+            loss = loss + self.unsupervised(generator)
         return loss
 
 
@@ -320,14 +327,16 @@ def run(config: TrainRegressorConfig) -> Regressor:
     training = RegressorTraining.of(config)
     name = f"{training.data.garment_name}{config.suffix}"
     work = config.out / "work" / f"{name}-regressor"
-    described = fit_descriptor(training, work)
     regressor = training.regressor
-    regressor.standardise(training.data.of_split("train"))
+    if config.start is not None:
+        regressor.load_state_dict(Regressor.load(config.start).state_dict())
+    else:
+        fit_descriptor(training, work)
+        regressor.standardise(training.data.of_split("train"))
     result = train(training, work)
     regressor.eval()
     regressor.story = {
         "config": json.loads(json.dumps(asdict(config), default=str)),
-        "descriptor loss": described.loss,
         "loss": result.loss,
         "curves": read_curves(work / "curves.jsonl"),
     }
