@@ -110,7 +110,8 @@ def test_import_is_light_and_public_names_resolve():
         ),
         (
             ["evaluate"],
-            "workbench: workbench evaluate needs a NAME, one of fields, projection, subspace, collisions, runtime; got nothing",
+            "workbench: workbench evaluate needs a NAME, one of "
+            "fields, projection, subspace, collisions, runtime; got nothing",
         ),
         (["train", "cats"], "workbench: workbench train needs a STAGE, one of fields, subspace, regressor; got 'cats'"),
         (["doctor", "--fast"], "workbench: workbench doctor takes no options, got '--fast'"),
