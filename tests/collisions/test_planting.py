@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from workbench.collisions.penetration import penetration
-from workbench.collisions.planting import dent
+from workbench.collisions.planting import Plant, dent, planted
 from workbench.geometry.mesh import unique_edges
 
 
@@ -36,3 +36,21 @@ def test_what_cannot_be_planted_is_refused(ball):
         dent(vertices, edges, vertices, faces, centre=9999)
     with pytest.raises(ValueError, match="depth is 0"):
         dent(vertices, edges, vertices, faces, centre=0, depth=0.0)
+
+
+def test_plants_are_in_their_frames_and_nowhere_else(ball):
+    vertices, faces = ball
+    garment, bodies = (1.1 * vertices).repeat(4, 1, 1), vertices.repeat(4, 1, 1)
+    plants = [Plant(7, 1, 2, depth=0.05, rings=2), Plant(900, 3, 3, depth=0.02, rings=1)]
+    made = planted(garment, unique_edges(faces), bodies, faces, plants)
+    found = penetration(bodies, faces, made)
+    assert found.per_frame.tolist() == [0, *[len(dent_patch(ball, 7, 2))] * 2, len(dent_patch(ball, 900, 1))]
+    assert found.inside[1, 7]
+    assert found.inside[3, 900]
+    with pytest.raises(ValueError, match="frames 3 to 4 are not all there: the garment has 4"):
+        planted(garment, unique_edges(faces), bodies, faces, [Plant(7, 3, 4)])
+
+
+def dent_patch(ball, vertex, rings):
+    vertices, faces = ball
+    return dent(1.1 * vertices, unique_edges(faces), vertices, faces, vertex, rings, 0.05).patch

@@ -1,5 +1,6 @@
 """Faults on purpose: a patch of the garment pushed into the body, to prove and to teach what the inspector finds."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,40 @@ class Dent:
 
     garment: Float[Tensor, "N 3"]
     patch: Int[Tensor, "K"]  # the vertices that were moved
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A dent around one vertex, over some frames."""
+
+    vertex: int
+    first_frame: int
+    last_frame: int
+    depth: float = 0.008  # metres
+    rings: int = 3  # edges from the vertex to the rim
+
+
+def planted(
+    garment: Float[Tensor, "T N 3"],
+    edges: Int[Tensor, "E 2"],
+    body: Float[Tensor, "T V 3"],
+    body_faces: Int[Tensor, "F 3"],
+    plants: Sequence[Plant],
+) -> Float[Tensor, "T N 3"]:
+    """The garment with all dents in their frames.
+
+    Errors: ValueError for frames or vertices that are not there.
+    """
+    moved = garment.clone()
+    for plant in plants:
+        if not 0 <= plant.first_frame <= plant.last_frame < len(garment):
+            raise ValueError(
+                f"frames {plant.first_frame} to {plant.last_frame} are not all there: the garment has {len(garment)}"
+            )
+        for frame in range(plant.first_frame, plant.last_frame + 1):
+            made = dent(moved[frame], edges, body[frame], body_faces, plant.vertex, plant.rings, plant.depth)
+            moved[frame] = made.garment
+    return moved
 
 
 def dent(

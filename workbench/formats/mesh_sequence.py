@@ -281,8 +281,14 @@ def _check_mesh(path: Path, vertices: ndarray, faces: ndarray) -> None:
     count = vertices.shape[-2]
     if count == 0 or len(faces) == 0:
         raise ValueError(f"{path} holds {count} vertices and {len(faces)} faces: expected a mesh")
-    if not np.isfinite(vertices).all():
-        raise ValueError(f"{path} holds NaN or infinite coordinates")
+    finite = np.isfinite(vertices).all(axis=-1)
+    if not finite.all():
+        bad = np.argwhere(~np.atleast_2d(finite))
+        frame, vertex = bad[0].tolist()
+        raise ValueError(
+            f"{path} holds NaN or infinite coordinates: {len(bad)} vertices in {len(np.unique(bad[:, 0]))} frames, "
+            f"first vertex {vertex} in frame {frame}"
+        )
     if faces.min() < 0 or faces.max() >= count:
         worst = int(faces.max() if faces.max() >= count else faces.min())
         raise ValueError(f"{path}: faces index vertex {worst}, but the mesh has {count} vertices")
