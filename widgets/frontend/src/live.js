@@ -1,1 +1,81 @@
-export default { render() {} };
+// The notebook's side of widgets/live.py: one store a model, kept current by messages; any number of views of it.
+import { bytesOf, typed } from "./decode.js";
+import { NoWebGL } from "./stage.js";
+import { fault, mount } from "./view.js";
+import { stream } from "./stream.js";
+
+const models = new WeakMap();
+
+function storeOf(model) {
+  let entry = models.get(model);
+  if (!entry) models.set(model, (entry = { store: read(model), views: new Set() }));
+  return entry;
+}
+
+function read(model) {
+  const { header, buffers } = model.get("scene");
+  const arrays = {};
+  for (const [key, buffer] of Object.entries(buffers)) arrays[key] = typed(header.arrays[key], bytesOf(buffer));
+  return { header, arrays };
+}
+
+function initialize({ model }) {
+  const entry = storeOf(model);
+  const onMessage = (message, buffers) => {
+    if (message.kind !== "renew") return;
+    const arrays = {};
+    for (const key of Object.keys(message.header.arrays)) {
+      const place = message.keys.indexOf(key);
+      arrays[key] = place < 0 ? entry.store.arrays[key] : typed(message.header.arrays[key], bytesOf(buffers[place]));
+    }
+    entry.store = { header: message.header, arrays };
+    for (const view of entry.views) view.renew({ ...entry.store });
+  };
+  model.on("msg:custom", onMessage);
+  return () => model.off("msg:custom", onMessage);
+}
+
+function render({ model, el }) {
+  const entry = storeOf(model);
+  const [width, height] = model.get("size");
+  let handle;
+  const options = {
+    width, height,
+    onRest: (frame) => {
+      if (model.get("frame") === frame) return;
+      model.set("frame", frame);
+      model.save_changes();
+    },
+    onPick: (read) => {
+      model.set("picked", { layer: read.layer, vertex: read.vertex, frame: handle.frame() });
+      model.save_changes();
+    },
+  };
+  el.style.cssText = `width: 100%; max-width: ${width}px`;
+  try {
+    if (model.get("refuse_webgl")) throw new NoWebGL("switched off");
+    handle = mount(el, { ...entry.store }, options);
+  } catch (error) {
+    if (!(error instanceof NoWebGL)) {
+      fault(el, `The 3-D view could not be shown: ${error?.message ?? error}`);
+      throw error;
+    }
+    return stream(el, model, entry.store.header, [width, height], error.message);
+  }
+  handle.setFrame(model.get("frame"), true);
+  entry.views.add(handle);
+  const onFrame = () => handle.setFrame(model.get("frame"), true);
+  const onMessage = (message) => {
+    if (message.kind === "fault") handle.note(message.text);
+  };
+  model.on("change:frame", onFrame);
+  model.on("msg:custom", onMessage);
+  return () => {
+    model.off("change:frame", onFrame);
+    model.off("msg:custom", onMessage);
+    entry.views.delete(handle);
+    handle.dispose();
+  };
+}
+
+export default { initialize, render };
