@@ -6,6 +6,7 @@ Where the browser has no WebGL it asks for pictures, which the kernel draws on i
 """
 
 import logging
+import uuid
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +30,7 @@ class LiveScene(anywidget.AnyWidget):
     size = traitlets.List(trait=traitlets.Int()).tag(sync=True)
     frame = traitlets.Int(0).tag(sync=True)
     picked = traitlets.Dict().tag(sync=True)
+    key = traitlets.Unicode().tag(sync=True)  # by which the browser finds the store of this model
     refuse_webgl = traitlets.Bool(False).tag(sync=True)  # draw in the kernel although the browser could
 
     def __init__(self, shown: Scene, size: tuple[int, int] = (900, 560), **traits: Any):
@@ -37,7 +39,11 @@ class LiveScene(anywidget.AnyWidget):
         wire = _encoded(shown, size)
         buffers = {key: array.tobytes() for key, array in wire.arrays.items()}
         super().__init__(
-            _esm=bundled("view.js"), scene={"header": wire.header, "buffers": buffers}, size=list(size), **traits
+            _esm=bundled("view.js"),
+            scene={"header": wire.header, "buffers": buffers},
+            size=list(size),
+            key=uuid.uuid4().hex,
+            **traits,
         )
         self.on_msg(self._answer)
 

@@ -4,11 +4,13 @@ import { NoWebGL } from "./stage.js";
 import { fault, mount } from "./view.js";
 import { stream } from "./stream.js";
 
-const models = new WeakMap();
+// By the key that the kernel gave the model: anywidget hands initialize and render different objects for one model.
+const models = new Map();
 
 function storeOf(model) {
-  let entry = models.get(model);
-  if (!entry) models.set(model, (entry = { store: read(model), views: new Set() }));
+  const key = model.get("key");
+  let entry = models.get(key);
+  if (!entry) models.set(key, (entry = { store: read(model), views: new Set() }));
   return entry;
 }
 
@@ -32,7 +34,10 @@ function initialize({ model }) {
     for (const view of entry.views) view.renew({ ...entry.store });
   };
   model.on("msg:custom", onMessage);
-  return () => model.off("msg:custom", onMessage);
+  return () => {
+    model.off("msg:custom", onMessage);
+    models.delete(model.get("key"));
+  };
 }
 
 function render({ model, el }) {
