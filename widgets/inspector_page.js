@@ -26,22 +26,23 @@
   const seconds = (frame) => `${(frame / data.fps).toFixed(2)} s`;
   const inFile = (frame) => (data.first || data.every > 1 ? `, frame ${data.first + frame * data.every} of the file` : "");
 
-  function isolate(region) {
-    chosen = region;
+  /** A garment vertex slides over the body, but has one region to isolate: `whole` says that it fits this cell's vertices. */
+  function isolate(region, whole) {
+    chosen = [region, whole];
     all.hidden = region === null;
     view?.isolateRegion("body", region);
-    view?.isolateRegion("garment", region);
+    view?.isolateRegion("garment", whole ? region : null);
   }
 
-  function go(frame, region, vertex, text) {
+  function go(frame, region, whole, vertex, text) {
     cursor(frame);
-    isolate(region);
+    isolate(region, whole);
     if (view) {
       const index = nearest(frame);
       view.setFrame(index);
       view.choose("garment", "depth inside the body");
       if (data.shown[index] !== frame) text += ` The 3-D view does not hold this frame; it shows frame ${data.shown[index]}.`;
-      else if (vertex !== null) view.pick("garment", vertex);
+      if (vertex !== null) view.pick("garment", vertex);
     }
     told.textContent = text;
     document.body.dataset.frame = frame;
@@ -49,13 +50,13 @@
   }
 
   function goCell(frame, r) {
-    const [, , count, depth, vertex] = cells.get(`${frame},${r}`);
-    go(frame, data.regions[r], vertex, `${data.regions[r]}, frame ${frame} (${seconds(frame)}${inFile(frame)}): ${count} `
+    const [, , count, depth, vertex, whole] = cells.get(`${frame},${r}`);
+    go(frame, data.regions[r], Boolean(whole), vertex, `${data.regions[r]}, frame ${frame} (${seconds(frame)}${inFile(frame)}): ${count} `
       + `${count === 1 ? "vertex" : "vertices"} inside, the deepest ${depth.toFixed(2)} mm (vertex ${vertex}).`);
   }
 
   function goFrame(frame) {
-    go(frame, null, null, `Frame ${frame} (${seconds(frame)}${inFile(frame)}): ${data.inside[frame]} vertices inside, `
+    go(frame, null, false, null, `Frame ${frame} (${seconds(frame)}${inFile(frame)}): ${data.inside[frame]} vertices inside, `
       + `the deepest ${data.deepest[frame].toFixed(2)} mm.`);
   }
 
@@ -69,10 +70,10 @@
     row.addEventListener("click", () => {
       mark(row);
       goCell(+row.dataset.f, data.regions.indexOf(row.dataset.n));
-      if (view && data.shown.includes(+row.dataset.f)) view.pick("garment", +row.dataset.v);
+      view?.pick("garment", +row.dataset.v);
     });
   }
-  all.addEventListener("click", () => { mark(null); isolate(null); });
+  all.addEventListener("click", () => { mark(null); isolate(null, false); });
 
   function adopt(handle) {
     view = handle;
@@ -81,7 +82,7 @@
     handle.setFrame(nearest(first ? +first.dataset.f : 0));
     handle.ghost("body");
     cursor(data.shown[handle.frame()]);
-    if (chosen !== null) isolate(chosen);
+    if (chosen !== null) isolate(...chosen);
   }
   if (window.workbenchView) adopt(window.workbenchView);
   else document.addEventListener("workbench-view", (event) => adopt(event.detail));

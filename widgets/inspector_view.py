@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 HERE = Path(__file__).parent
 PAGE_BYTES = 8e6  # what the 3-D part may add to a page that is sent to a colleague
-BYTES_A_VERTEX = 2.0  # of a frame: positions, depth and marks, deflated, in base64 (measured: 1.2 to 2)
+BYTES_A_VERTEX = 3.0  # of a frame: positions, depth, cause and marks, deflated, in base64 (measured: 1.2 to 2.7)
 MOST_VERTICES = 300_000  # more than a page should make a browser turn
 MOST_COLUMNS = 360  # of the heat map; beyond it neighbouring frames share a column
 CAUSE_COLOURS = dict(zip(CAUSES, ("#0072b2", "#009e73", "#e69f00", "#d55e00", "#cc79a7", "#777777")))
@@ -53,7 +53,7 @@ def inspection_page(result: InspectionResult) -> str:
     files = dict.fromkeys(Path(result.report[side]["file"]).name for side in ("garment", "body"))
     title = f"Collisions: {' on '.join(files)}"
     chart = f"{_cell_readout()}{heat_map(result)}{_legend(result)}"
-    above = f'<div id="charts">{_summary(result)}{_how_to_read()}{chart}{_incidents(result)}</div>'
+    above = f'<div id="charts">{_summary(result, len(frames))}{_how_to_read()}{chart}{_incidents(result)}</div>'
     data = json.dumps(page_data(result, frames)).replace("<", "\\u003c")
     below = f'{_tables(result)}<script type="application/json" id="inspection">{data}</script>'
     style, script = _beside("inspector_page.css"), _beside("inspector_page.js")
@@ -74,7 +74,8 @@ def inspection_page(result: InspectionResult) -> str:
 
 
 def shown_frames(result: InspectionResult) -> Int[ndarray, "K"]:
-    """The frames that the 3-D view holds: all where they fit, else evenly thinned, with the worst of each region."""
+    """The frames that the 3-D view holds: all where they fit, else evenly thinned, with the worst of each incident that
+    the page lists."""
     count = result.body.vertices.shape[1] + result.garment.vertices.shape[1]
     frames = len(result.garment)
     if count > MOST_VERTICES:
@@ -82,10 +83,9 @@ def shown_frames(result: InspectionResult) -> Int[ndarray, "K"]:
     most = max(int(PAGE_BYTES / (BYTES_A_VERTEX * count)), 1)
     if frames <= most:
         return np.arange(frames)
-    deepest = result.found.depth_map
-    worst = [int(deepest[:, r].argmax()) for r in deepest.amax(dim=0).argsort(descending=True) if deepest[:, r].any()]
-    spread = np.linspace(0, frames - 1, max(most - len(worst), 1)).round().astype(int)
-    return np.unique(np.concatenate([np.array(worst[:most], int), spread]))[:most]
+    worst = list(dict.fromkeys(incident["worst_frame"] for incident in result.report["incidents"]))[:most]
+    spread = np.linspace(0, frames - 1, most - len(worst)).round().astype(int)
+    return np.unique(np.concatenate([np.array(worst, int), spread]))
 
 
 def inspection_scene(result: InspectionResult, frames: Int[ndarray, "K"] | None = None) -> Scene:
@@ -119,12 +119,12 @@ def inspection_scene(result: InspectionResult, frames: Int[ndarray, "K"] | None 
                         name="garment",
                         marked=found.inside.numpy()[keep],
                         choices=choices,
-                        regions=Regions(found.region_of_vertex.numpy(), names),
+                        regions=Regions(garment_regions(result).numpy(), names),
                     ),
                 )
             ),
         ),
-        fps=result.garment.fps,
+        fps=result.garment.fps * len(keep) / len(result.garment),
     )
 
 
@@ -170,15 +170,26 @@ def page_data(result: InspectionResult, frames: Int[ndarray, "K"]) -> dict[str, 
     }
 
 
+def garment_regions(result: InspectionResult) -> Int[torch.Tensor, "N"]:
+    """One region for each garment vertex, to isolate: where it collides most often, else where it is most often."""
+    found, names = result.found, result.found.regions.names
+    frame, vertex = found.inside.nonzero(as_tuple=True)
+    cell = vertex * len(names) + found.region[frame, vertex]
+    often = torch.bincount(cell, minlength=found.inside.shape[1] * len(names)).reshape(-1, len(names))
+    return torch.where(often.any(dim=1), often.argmax(dim=1), found.region_of_vertex)
+
+
 def cells(result: InspectionResult) -> list[list[int | float]]:
-    """[frame, region, vertices inside, deepest mm, its vertex] of every cell with a collision."""
+    """[frame, region, vertices inside, deepest mm, its vertex, 1 where the garment's region holds all of them] of every
+    cell with a collision."""
     found = result.found
-    heat, region, depth = found.heat_map, found.region, found.depth
+    heat, region, depth, of_vertex = found.heat_map, found.region, found.depth, garment_regions(result)
     made = []
     for frame, r in heat.nonzero().tolist():
-        here = torch.where(region[frame] == r, depth[frame], -1.0)
-        vertex = int(here.argmax())
-        made.append([frame, r, int(heat[frame, r]), round(1e3 * float(here[vertex]), 2), vertex])
+        here = (region[frame] == r) & found.inside[frame]
+        vertex = int(torch.where(here, depth[frame], -1.0).argmax())
+        whole = int((of_vertex[here] == r).all())
+        made.append([frame, r, int(heat[frame, r]), round(1e3 * float(depth[frame, vertex]), 2), vertex, whole])
     return made
 
 
@@ -292,10 +303,12 @@ def _shade(share: float) -> str:
 # --- words
 
 
-def _summary(result: InspectionResult) -> str:
+def _summary(result: InspectionResult, shown: int) -> str:
     report = result.report
     where = f"{report['frames']} frames, garment of {report['garment']['vertices']:,} vertices, body of "
     where += f"{report['body']['vertices']:,}"
+    if 0 < shown < report["frames"]:
+        where += f"; the 3-D view holds {shown} of the frames, with the worst of each listed incident"
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in report["notes"])
     listed = f'<ul class="notes">{notes}</ul>' if notes else ""
     return f'<p class="found">{html.escape(summary(report))}.</p><p class="quiet">{where}.</p>{listed}'
@@ -309,7 +322,10 @@ def _how_to_read() -> str:
         "Click a cell: the view jumps to that frame and shows that region alone.</li>"
         "<li>In the view, pink dots are vertices inside the body, drawn through whatever hides them. Drag to turn.</li>"
         "<li>An edge can cross the body although both its ends are outside; such edges are counted apart.</li>"
-        "<li>Where the body overlaps itself, no garment could be free; such vertices are counted apart, too.</li></ul>"
+        "<li>A vertex in two layers of the body at once could not be free; such vertices are counted apart, too.</li>"
+        "<li>Where the file holds the garment after each stage of a try-on, the <b>bars</b> are coloured by the stage after "
+        "which a vertex was first inside, or by <i>body overlap</i> where this pose leaves no room: the skin under the "
+        "vertex is buried in another limb.</li></ul>"
         "</details>"
     )
 
@@ -364,7 +380,7 @@ def _tables(result: InspectionResult) -> str:
     report, totals = result.report, result.report["totals"]
     rows = [
         ("vertices inside, of all vertices of all frames", f"{totals['inside']:,} ({totals['inside_percent']:.3f} %)"),
-        ("of them, where the body overlaps itself", f"{totals['of_it_where_the_body_overlaps_itself']:,}"),
+        ("of them, in two layers of the body at once", f"{totals['of_it_where_the_body_overlaps_itself']:,}"),
         ("different vertices that are ever inside", f"{totals['vertices_ever_inside']:,}"),
         ("depth: median, largest", f"{totals['depth_mm']['median']:.2f}, {totals['depth_mm']['max']:.2f} mm"),
         ("edges that cross the body", f"{totals['crossing_edges']:,} ({totals['crossing_edges_percent']:.3f} %)"),

@@ -15,6 +15,7 @@ from widgets.frontend_bundle import NotBundled
 from widgets.inspector_view import (
     cells,
     close_up,
+    garment_regions,
     heat_map,
     inspection_page,
     inspection_scene,
@@ -54,9 +55,12 @@ def result() -> InspectionResult:
 def test_every_collision_has_a_cell_with_its_worst_vertex(result):
     made = cells(result)
     assert sum(cell[2] for cell in made) == result.report["totals"]["inside"]
-    for frame, region, count, depth, vertex in made:
+    of_vertex = garment_regions(result)
+    for frame, region, count, depth, vertex, whole in made:
         assert result.found.heat_map[frame, region] == count
         assert result.found.region[frame, vertex] == region
+        here = result.found.inside[frame] & (result.found.region[frame] == region)
+        assert whole == bool((of_vertex[here] == region).all())
         assert 1e3 * float(result.found.depth[frame, vertex]) == pytest.approx(depth, abs=0.006)
         assert 1e3 * float(result.found.depth_map[frame, region]) == pytest.approx(depth, abs=0.006)
     drawn = {
@@ -106,8 +110,11 @@ def test_a_long_sequence_keeps_the_worst_frames(result, monkeypatch):
     kept = shown_frames(result)
     assert len(kept) <= 4
     worst = {incident["worst_frame"] for incident in result.report["incidents"]}
-    assert worst & set(kept.tolist())
-    assert inspection_scene(result, kept).frames == len(kept)
+    assert worst <= set(kept.tolist())
+    scene = inspection_scene(result, kept)
+    assert scene.frames == len(kept)
+    assert scene.frames / scene.fps == pytest.approx(FRAMES / 30.0)  # plays as long as the whole
+    assert f"the 3-D view holds {len(kept)} of the frames" in inspection_page(result)
 
 
 def test_the_scene_marks_what_is_inside(result):
