@@ -323,8 +323,8 @@ def _how_to_read() -> str:
         "<li>In the view, pink dots are vertices inside the body, drawn through whatever hides them. Drag to turn.</li>"
         "<li>An edge can cross the body although both its ends are outside; such edges are counted apart.</li>"
         "<li>A vertex in two layers of the body at once could not be free; such vertices are counted apart, too.</li>"
-        "<li>Where the file holds the garment after each stage of a try-on, the <b>bars</b> are coloured by the stage after "
-        "which a vertex was first inside, or by <i>body overlap</i> where this pose leaves no room: the skin under the "
+        "<li>Where the file holds the garment after each stage of a try-on, the <b>bars</b> are coloured by the "
+        "stage after which a vertex was first inside, or by <i>body overlap</i> where this pose leaves no room: the skin under the "
         "vertex is buried in another limb.</li></ul>"
         "</details>"
     )
