@@ -324,8 +324,8 @@ def _how_to_read() -> str:
         "<li>An edge can cross the body although both its ends are outside; such edges are counted apart.</li>"
         "<li>A vertex in two layers of the body at once could not be free; such vertices are counted apart, too.</li>"
         "<li>Where the file holds the garment after each stage of a try-on, the <b>bars</b> are coloured by the "
-        "stage after which a vertex was first inside, or by <i>body overlap</i> where this pose leaves no room: the skin under the "
-        "vertex is buried in another limb.</li></ul>"
+        "stage after which a vertex was first inside, or by <i>body overlap</i> where this pose leaves no room: "
+        "the skin under the vertex is buried in another limb.</li></ul>"
         "</details>"
     )
 
