@@ -1,4 +1,4 @@
-"""`workbench demo`'s picture: simulated, canonical and re-posed side by side, a row a frame."""
+"""The spine's picture: simulated, canonical and re-posed side by side, a row a frame."""
 
 import logging
 from pathlib import Path
@@ -46,7 +46,7 @@ def demo_scene(result: DemoResult, rows: int = ROWS) -> Scene:
 def _view(result: DemoResult, place: DressedBody, frame: int, title: str) -> View:
     body = place.body[min(frame, len(place.body) - 1)].numpy()
     inside = place.collisions.inside[frame].numpy()
-    here = _middle(body)  # the walk is taken out: all views share one camera
+    here = standing_place(body)  # the walk is taken out: all views share one camera
     counted = f"{title}: {int(inside.sum())} inside"
     return dressed(
         body - here,
@@ -58,7 +58,7 @@ def _view(result: DemoResult, place: DressedBody, frame: int, title: str) -> Vie
     )
 
 
-def _middle(vertices: Float[ndarray, "V 3"]) -> Float[ndarray, "3"]:
+def standing_place(vertices: Float[ndarray, "V 3"]) -> Float[ndarray, "3"]:
     """Where the body stands: the middle of its outline, on the floor."""
     low, high = vertices.min(0), vertices.max(0)
     return np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0], dtype=vertices.dtype)

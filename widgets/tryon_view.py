@@ -4,9 +4,8 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
+from widgets.demo_picture import standing_place
 from widgets.frontend_bundle import NotBundled
 from widgets.gl import CannotDraw
 from widgets.page import write_page
@@ -47,7 +46,7 @@ def strip(demo: TryOnDemo, columns: int = COLUMNS) -> Scene:
     above, below = [], []
     for frame in frames:
         body = result.body[frame].numpy()
-        here = _middle(body)
+        here = standing_place(body)
         inside, within = demo.posed.inside[frame].numpy(), demo.canonical.inside[frame].numpy()
         faces = result.body_faces.numpy(), result.garment_faces.numpy()
         above.append(
@@ -76,7 +75,7 @@ def strip(demo: TryOnDemo, columns: int = COLUMNS) -> Scene:
 def moving(demo: TryOnDemo) -> Scene:
     """Posed and canonical side by side, over time; vertices inside the body are marked."""
     result = demo.result
-    here = np.stack([_middle(body) for body in result.body.numpy()])[:, None]
+    here = np.stack([standing_place(body) for body in result.body.numpy()])[:, None]
     here[..., 2] = 0.0
     posed = View(
         (
@@ -105,9 +104,3 @@ def moving(demo: TryOnDemo) -> Scene:
         "canonical",
     )
     return Scene((posed, canonical), columns=2)
-
-
-def _middle(vertices: Float[ndarray, "V 3"]) -> Float[ndarray, "3"]:
-    """Where the body stands: the middle of its outline, on the floor."""
-    low, high = vertices.min(0), vertices.max(0)
-    return np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0], dtype=vertices.dtype)

@@ -1,4 +1,7 @@
-"""`workbench demo`: a simulated sequence -> canonical space (Eq. 9) -> another body (Eq. 7)."""
+"""The spine in one run: a simulated sequence -> canonical space (Eq. 9) -> another body (Eq. 7).
+
+`python -m assets_gen simulations --motion FILE` ends with it; `workbench demo` (tryon_demo.py) shows the learned model.
+"""
 
 import json
 import logging

@@ -15,14 +15,12 @@ from workbench.body.model import Body
 from workbench.collisions.penetration import Penetration, penetration
 from workbench.collisions.tryon import TryOn, TryOnResult, shape_from_words
 from workbench.formats import load_motion, motion_files
-from workbench.formats.gltf import GltfMesh, write_glb
+from workbench.formats.gltf import dressed_meshes, write_glb
 from workbench.formats.mesh_sequence import MeshSequence
 from workbench.store import atomic_write
 
 log = logging.getLogger(__name__)
 
-SKIN = (0.72, 0.50, 0.38)
-CLOTH = (0.10, 0.26, 0.52)
 SHOWN = "test_hula_01"
 
 
@@ -58,7 +56,7 @@ def run(config: TryOnDemoConfig, picture: Output | None = None, page: Output | N
     """Compute, then write tryon.glb and report.json (and tryon.png, tryon.html where they can be drawn)."""
     demo = dress(config)
     config.out.mkdir(parents=True, exist_ok=True)
-    write_glb(config.out / "tryon.glb", gltf_meshes(demo.result))
+    write_glb(config.out / "tryon.glb", dressed_meshes(*sequences(demo.result)))
     if picture is not None:
         picture(demo, config.out / "tryon.png")
     if page is not None:
@@ -94,16 +92,13 @@ def dress(config: TryOnDemoConfig) -> TryOnDemo:
     return TryOnDemo(result, posed, canonical, Body.default().template, report)
 
 
-def gltf_meshes(result: TryOnResult) -> list[GltfMesh]:
-    """Body and garment, ready for a glTF file."""
-
-    def moving(name: str, vertices: Tensor, faces: Tensor) -> MeshSequence:
-        return MeshSequence(vertices=vertices.numpy(), faces=faces.numpy(), fps=result.motion.fps, name=name)
-
-    return [
-        GltfMesh(moving("body", result.body, result.body_faces), colour=SKIN),
-        GltfMesh(moving("garment", result.garment, result.garment_faces), colour=CLOTH, double_sided=True),
-    ]
+def sequences(result: TryOnResult) -> tuple[MeshSequence, MeshSequence]:
+    """Body and garment as moving meshes."""
+    fps = result.motion.fps
+    return (
+        MeshSequence(result.body.numpy(), result.body_faces.numpy(), fps, "body"),
+        MeshSequence(result.garment.numpy(), result.garment_faces.numpy(), fps, "garment"),
+    )
 
 
 def _motion_file(name: str) -> Path:

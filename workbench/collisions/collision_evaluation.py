@@ -66,8 +66,8 @@ def rows(config: CollisionEvaluation) -> list[Row]:
             table += collision_rows(f"{name}, {variant}", tryon, cleared, config, bound)
             if config.raw:
                 table += collision_rows(f"{name}, {variant}, raw motion", tryon, worn, config, None)
-        if config.motions is None:
-            table += fidelity_rows(name, next(iter(variants.values())))
+            if config.motions is None:
+                table += fidelity_rows(f"{name}, {variant}", tryon)
     return table
 
 
@@ -173,27 +173,29 @@ def count(tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], every: int) -> Co
 
 
 @torch.no_grad()
-def fidelity_rows(name: str, tryon: TryOn) -> list[Row]:
+def fidelity_rows(label: str, tryon: TryOn) -> list[Row]:
     """Against simulation on the unseen test sequences: error, gap and wrinkles (collisions must not be won by
     inflating or ironing the garment)."""
     laplacian = umbrella_laplacian(tryon.garment.faces, len(tryon.garment.vertices))
     sums = np.zeros(7)
-    for s in shipped_tests(name):
+    for s in shipped_tests(tryon.garment.name):
         index = torch.arange(0, len(s), 6)
         index = index[s.valid[index]]
         if len(index):
             sums += len(index) * _compared(tryon, s, index, laplacian)
     frames = sums[0]
     if not frames:
-        raise ValueError(f"no test sequence of garment {name!r} ships; make some: python -m assets_gen dataset --ship")
+        raise ValueError(
+            f"no test sequence of garment {tryon.garment.name!r} ships; make some: python -m assets_gen dataset --ship"
+        )
     error, skinned, gap, wanted_gap, folds, wanted_folds = sums[1:] / frames
     return [
-        told(f"{name}: frames compared with simulation", frames, "frames"),
-        told(f"{name}: vertex error on unseen sequences, mean", MILLI * error, "mm"),
-        told(f"{name}: the same of the skinned template", MILLI * skinned, "mm"),
-        at_least(f"{name}: error below skinning the template", PERCENT * (1 - error / skinned), "%", 30.0),
-        within(f"{name}: mean gap to the body / simulation's", gap / wanted_gap, "", 0.8, 1.2),
-        within(f"{name}: Laplacian energy / simulation's", folds / wanted_folds, "", 0.7, 1.2),
+        told(f"{label}: frames compared with simulation", frames, "frames"),
+        told(f"{label}: vertex error on unseen sequences, mean", MILLI * error, "mm"),
+        told(f"{label}: the same of the skinned template", MILLI * skinned, "mm"),
+        at_least(f"{label}: error below skinning the template", PERCENT * (1 - error / skinned), "%", 30.0),
+        within(f"{label}: mean gap to the body / simulation's", gap / wanted_gap, "", 0.8, 1.2),
+        within(f"{label}: Laplacian energy / simulation's", folds / wanted_folds, "", 0.7, 1.2),
     ]
 
 

@@ -21,9 +21,9 @@ from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.winding import InsideTest
 
 MILLI = 1e3
-SURELY_OUTSIDE = (
-    0.5  # cosine between the way to a point and the surface normal there: above it no winding number is asked
-)
+# Cosine between the way to a point and the surface normal there.  Above it no winding number is asked: a third of the
+# time (15 against 45 ms a frame), 0.00 to 0.10 % of the signs wrong on three test sequences.  Evaluation is exact.
+SURELY_OUTSIDE = 0.5
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """5-6: the runtime.  beta (10), motion -> x_bar (T,25) -> X (T,N,3) -> posed garment (T,N,3).
 
 `TryOn.run` dresses a whole motion; `TryOn.stream` a frame at a time, with the same result.  The networks run in torch,
-or in onnxruntime (`with_onnx`); the fields come from the table, or from the paper's networks (`GarmentModel`'s fields).
+or in onnxruntime (`tryon_onnx`); the fields come from the table or the paper's networks (`GarmentModel.fields`).
 """
 
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -276,8 +276,3 @@ def shape_from_words(words: str, body: Body) -> Float[Tensor, "K"]:
     full = body.mean_shape()
     full[: len(given)] = torch.tensor(given)
     return checked_shape(full, body)
-
-
-def with_networks(tryon: TryOn, networks: Networks) -> TryOn:
-    """The same try-on on another runtime."""
-    return replace(tryon, networks=networks)

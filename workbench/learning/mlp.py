@@ -6,11 +6,9 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from workbench.store import atomic_write
+from workbench.learning.network_file import read_network, write_network
 
 
 class MLP(nn.Module):
@@ -69,22 +67,17 @@ def parameter_count(module: nn.Module) -> int:
 
 
 def save_network(network: nn.Module, path: Path, *, kind: str, fingerprint: str) -> None:
-    """Write the parameters as float16 with what they are (`kind`) and what they were made for (`fingerprint`)."""
-    tensors = {name: tensor.detach().half().contiguous() for name, tensor in network.state_dict().items()}
-    with atomic_write(path) as part:
-        save_file(tensors, part, metadata={"kind": kind, "made_for": fingerprint})
+    """Write the parameters with what they are (`kind`) and what they were made for (`fingerprint`)."""
+    write_network(network, path, {"kind": kind, "made_for": fingerprint})
 
 
 def load_network(network: nn.Module, path: Path, *, kind: str, fingerprint: str) -> None:
     """Fill `network` from `save_network`'s file.  ValueError for a missing, damaged or foreign file."""
-    if not path.is_file():
-        raise ValueError(f"there is no trained network {path}; make it with `workbench train fields`")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118  not a dict
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"network {path} is damaged ({error}); make it again with `workbench train fields`") from error
+        found = read_network(path, "make it with `workbench train fields`")
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+    metadata, tensors = found.metadata, found.tensors
     if metadata.get("kind") != kind:
         raise ValueError(f"network {path} is a {metadata.get('kind')!r} network, expected {kind!r}")
     if metadata.get("made_for") != fingerprint:
