@@ -44,14 +44,14 @@ def page(report):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))
         page = browser.new_page(viewport={"width": 1400, "height": 900})
-        page.troubles = []
-        page.on("console", lambda said: page.troubles.append(said.text) if said.type == "error" else None)
-        page.on("pageerror", lambda error: page.troubles.append(str(error)))
-        page.on("request", lambda asked: page.troubles.append(asked.url) if asked.url.startswith("http") else None)
+        troubles: list[str] = []
+        page.on("console", lambda said: troubles.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda asked: troubles.append(asked.url) if asked.url.startswith("http") else None)
         page.goto((report / "report.html").as_uri())
         page.wait_for_function("window.workbenchView", timeout=60_000)
         yield page
-        assert page.troubles == []
+        assert troubles == []
         browser.close()
 
 
