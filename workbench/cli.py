@@ -36,6 +36,7 @@ TRAININGS = {
     "fields": ("workbench.collisions.field_training", "TrainFieldsConfig"),
     "subspace": ("workbench.collisions.subspace", "TrainSubspaceConfig"),
     "regressor": ("workbench.collisions.regressor", "TrainRegressorConfig"),
+    "points": ("workbench.points.training_run", "TrainPointsConfig"),
 }
 
 

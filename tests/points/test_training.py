@@ -1,7 +1,5 @@
 """Training: it learns, resumes to the same model, and what it stores is what it trained."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -14,7 +12,6 @@ from workbench.points.scans import ScanFrame, ScanSequence
 from workbench.points.training import (
     PointTrainingConfig,
     ScanSet,
-    TrainedPoints,
     papers_training,
     thin,
     train_points,
@@ -44,9 +41,8 @@ def scans(body):
     return ScanSet.of(body, [worn(body, "thick", 0.03, 0), worn(body, "thin", 0.005, 1)], input_size=32)
 
 
-def config_of(model, **changes):
+def config_of(**changes):
     return PointTrainingConfig(
-        model=model.config,
         fit=FitConfig(steps=changes.pop("steps", 8), learning_rate=5e-3, warmup=2, clip_norm=100.0, checkpoint_every=4),
         **{
             "batch": 2,
@@ -69,7 +65,7 @@ def test_it_learns_and_tells_outfits_apart(scans, small_model):
     """After a short run the cloud lies nearer to the thick outfit's surface than the bare body does, and the thick
     outfit stands further off the body than the thin one."""
     model = fresh(small_model)
-    train_points(model, scans, config_of(model, steps=60))
+    train_points(model, scans, config_of(steps=60))
     assert not model.training
     batch = scans.batch([0])
     posed = posed_queries(atlas_of(scans.body, 48).queries, batch.bodies)
@@ -87,16 +83,16 @@ def test_it_learns_and_tells_outfits_apart(scans, small_model):
 def test_a_killed_run_ends_where_the_uninterrupted_one_does(scans, small_model, tmp_path):
     """Bit by bit, its statistics included."""
     whole, broken = fresh(small_model), fresh(small_model)
-    train_points(whole, scans, config_of(whole))
+    train_points(whole, scans, config_of())
 
     def kill(step, _):
         if step == 5:
             raise Killed
 
     with pytest.raises(Killed):
-        train_points(broken, scans, config_of(broken), checkpoint=tmp_path / "c.safetensors", watch=kill)
+        train_points(broken, scans, config_of(), checkpoint=tmp_path / "c.safetensors", watch=kill)
     resumed = fresh(small_model)
-    result = train_points(resumed, scans, config_of(resumed), checkpoint=tmp_path / "c.safetensors")
+    result = train_points(resumed, scans, config_of(), checkpoint=tmp_path / "c.safetensors")
     assert result.resumed_at == 4
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, resumed.state_dict()[name]), name
@@ -107,30 +103,13 @@ def test_half_precision_learns_alike(scans, small_model):
     runs: dict[str, list[float]] = {"float32": [], "bfloat16": []}
     for precision, losses in runs.items():
         model = fresh(small_model)
-        config = config_of(model, steps=4, precision=precision)
+        config = config_of(steps=4, precision=precision)
         train_points(model, scans, config, watch=lambda _, loss, losses=losses: losses.append(loss))
     assert runs["bfloat16"] == pytest.approx(runs["float32"], rel=0.05)
 
 
-def test_what_is_stored_is_what_was_trained(scans, small_model, trained_like, tmp_path, body):
-    trained = TrainedPoints(trained_like(fresh(small_model)), scans.outfits)
-    trained.save(tmp_path / "m.safetensors", body)
-    read = TrainedPoints.load(tmp_path / "m.safetensors", body)
-    assert read.outfits == ("thick", "thin")
-    assert read.model.config == trained.model.config
-    for name, tensor in trained.model.state_dict().items():
-        torch.testing.assert_close(read.model.state_dict()[name], tensor, atol=1e-3, rtol=1e-3)
-    with pytest.raises(ValueError, match=r"was trained for another body .*train it for this body"):
-        TrainedPoints.load(tmp_path / "m.safetensors", replace(body, template=body.template + 0.1))
-    with pytest.raises(ValueError, match="there is no trained points model"):
-        TrainedPoints.load(tmp_path / "n.safetensors", body)
-    (tmp_path / "m.safetensors").write_bytes(b"{}")
-    with pytest.raises(ValueError, match="is damaged"):
-        TrainedPoints.load(tmp_path / "m.safetensors", body)
-
-
-def test_normals_join_late(small_model):
-    config = config_of(small_model, steps=100, normals_from=0.3)
+def test_normals_join_late():
+    config = config_of(steps=100, normals_from=0.3)
     assert weights_at(29, config).normal == 1e-6
     assert weights_at(30, config).normal == 1.0
     assert weights_at(29, config).distance == weights_at(30, config).distance == 1e4

@@ -5,25 +5,21 @@ where the published training decodes every pixel of the map: the loss is a mean 
 look at all of its terms but the scan's distance to the cloud, which a sparser cloud overestimates alike everywhere.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from workbench.body.model import Body
 from workbench.geometry.chamfer import match
 from workbench.learning.fit import FitConfig, FitResult, fit
-from workbench.points.clothed_points import ClothedPoints, PointModel, PointModelConfig
-from workbench.points.geometry_features import GeometryFeaturesConfig
+from workbench.points.clothed_points import ClothedPoints
 from workbench.points.losses import (
     LossTerms,
     LossWeights,
@@ -32,9 +28,7 @@ from workbench.points.losses import (
     geometry_loss,
     normal_loss,
 )
-from workbench.points.pose_encoder import PoseEncoderConfig
 from workbench.points.scans import ScanFrame, ScanSequence, outfits_of
-from workbench.points.shape_decoder import ShapeDecoderConfig
 from workbench.points.uv_position_map import (
     INPUT_SIZE,
     QUERY_SIZE,
@@ -42,15 +36,12 @@ from workbench.points.uv_position_map import (
     PosedBodies,
     PosedQueries,
     SurfaceQueries,
-    atlas_fingerprint,
     atlas_of,
     posed_bodies,
     posed_queries,
 )
-from workbench.store import atomic_write
 
 Precision = Literal["float32", "bfloat16"]
-KIND = "points-1"  # of the file a trained model is stored in
 
 
 @runtime_checkable
@@ -74,11 +65,6 @@ class ClothesModel(Protocol):
 class PointTrainingConfig:
     """Ours for two cores by default; `papers_training()` is the paper's."""
 
-    model: PointModelConfig = PointModelConfig(
-        encoder=PoseEncoderConfig(width=16, features=32),
-        geometry=GeometryFeaturesConfig(size=64, features=32),
-        decoder=ShapeDecoderConfig(width=128, features=64),
-    )
     fit: FitConfig = FitConfig(
         steps=6000, learning_rate=1e-3, last_rate=1e-5, warmup=100, clip_norm=100.0, checkpoint_every=200
     )
@@ -100,7 +86,6 @@ def papers_training(frames: int) -> PointTrainingConfig:
     steps = 401 * max(1, math.ceil(frames / 4))
     rate = FitConfig(steps=steps, learning_rate=3e-4, last_rate=3e-4, warmup=1, clip_norm=1e9, checkpoint_every=500)
     return PointTrainingConfig(
-        model=PointModelConfig(),
         fit=rate,
         queries=QUERY_SIZE**2,
         scan_points=40_000,
@@ -191,6 +176,7 @@ def train_points(
     queries: SurfaceQueries | None = None,
     checkpoint: Path | None = None,
     watch: Callable[[int, float], None] | None = None,
+    label: str = "points",
 ) -> FitResult:
     """Minimise Eq. 3 over all parameters of the model, in place, then settle BatchNorm; resumes from `checkpoint`.
 
@@ -212,7 +198,7 @@ def train_points(
         config.fit,
         generator=generator,
         checkpoint=checkpoint,
-        label="points",
+        label=label,
         watch=watch,
     )
     settle(model, scans, places, config)
@@ -264,62 +250,3 @@ def thin(scan: ScanFrame, count: int, generator: torch.Generator) -> ScanFrame:
 def _train_mode(model: ClothesModel, *, training: bool) -> None:
     for module in model.modules():
         module.training = training
-
-
-# A trained model on disk
-
-
-@dataclass(frozen=True, eq=False)
-class TrainedPoints:
-    """A trained model and the outfits that its G are of, in order."""
-
-    model: PointModel
-    outfits: tuple[str, ...]
-
-    def save(self, path: str | Path, body: Body) -> None:
-        """safetensors: parameters as float16, statistics as float32; written whole or not at all."""
-        tensors = {}
-        for name, tensor in self.model.state_dict().items():
-            statistic = "running" in name or "tracked" in name  # a small variance would vanish in float16
-            tensors[name] = tensor.detach().contiguous() if statistic else tensor.detach().half().contiguous()
-        metadata = {
-            "kind": KIND,
-            "made_for": atlas_fingerprint(body),
-            "config": json.dumps(asdict(self.model.config)),
-            "outfits": json.dumps(self.outfits),
-        }
-        with atomic_write(path) as part:
-            save_file(tensors, part, metadata=metadata)
-
-    @staticmethod
-    def load(path: str | Path, body: Body) -> "TrainedPoints":
-        """Raises ValueError for a missing, damaged or foreign file, or one trained for another body."""
-        path = Path(path)
-        if not path.is_file():
-            raise ValueError(f"there is no trained points model {path}")
-        try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  not a dict
-        except (SafetensorError, OSError) as error:
-            raise ValueError(f"points model {path} is damaged ({error}); train or fetch it again") from error
-        if metadata.get("kind") != KIND:
-            raise ValueError(f"{path} is of kind {metadata.get('kind')!r}, expected {KIND!r}")
-        made_for, fingerprint = metadata.get("made_for"), atlas_fingerprint(body)
-        if made_for != fingerprint:
-            raise ValueError(
-                f"points model {path} was trained for another body ({made_for}, {body.name!r} is {fingerprint}); "
-                "train it for this body"
-            )
-        outfits = tuple(json.loads(metadata["outfits"]))
-        model = PointModel(len(outfits), _config_from(json.loads(metadata["config"])), generator=torch.Generator())
-        model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-        return TrainedPoints(model.eval(), outfits)
-
-
-def _config_from(stored: dict[str, dict]) -> PointModelConfig:
-    return PointModelConfig(
-        encoder=PoseEncoderConfig(**stored["encoder"]),
-        geometry=GeometryFeaturesConfig(**stored["geometry"]),
-        decoder=ShapeDecoderConfig(**stored["decoder"]),
-    )
