@@ -1,0 +1,28 @@
+"""`view(result)`: anything that a stage makes -> a panel to look at it, with the controls that teach the stage.
+
+The one public name of `widgets`.  What it returns shows itself as the last line of a notebook's cell: live where it can
+be, else as a picture, else as one line that says why.
+"""
+
+import functools
+from typing import Any
+
+from widgets.body_view import body_view
+from widgets.panel import Panel
+from widgets.subspace_view import subspace_view
+from workbench.body.model import Body
+from workbench.collisions.subspace import Subspace
+
+
+@functools.singledispatch
+def view(result: Any, *others: Any, **options: Any) -> Panel:
+    """A panel: `.scene`, `.live`, `.picture(size)`, `.page(path)`, `panel["latent"] = ...`.
+
+    Errors: TypeError for what no stage makes.
+    """
+    known = ", ".join(sorted(kind.__name__ for kind in view.registry if kind is not object))
+    raise TypeError(f"there is no view of a {type(result).__name__}; there are views of {known}")
+
+
+view.register(Body, body_view)
+view.register(Subspace, subspace_view)
