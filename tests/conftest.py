@@ -11,7 +11,9 @@ os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 
 from jaxtyping import install_import_hook
 
-import workbench.geometry.warp_kernels  # noqa: F401  Warp's kernels are no Python functions: imported unchecked
+# Warp's kernels are no Python functions: imported unchecked
+import workbench.collisions.posing_kernels
+import workbench.geometry.warp_kernels  # noqa: F401
 
 install_import_hook(["workbench", "widgets"], "beartype.beartype")
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from workbench.body.model import Body
 from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.frame_posing import frame_poser
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.motion_descriptor import DescriptorStream
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
@@ -191,6 +192,7 @@ class TryOnStream:
 
     def __init__(self, tryon: TryOn, betas: Float[Tensor, "K"]):
         self.tryon, self.betas = tryon, betas
+        self.pose = frame_poser(tryon.model, betas, tryon.subspace.vertex_count)
         self.describe = DescriptorStream(tryon.regressor.describe, tryon.regressor.fps)
         self.hidden = torch.zeros(LAYERS, 1, HIDDEN)
 
@@ -203,8 +205,7 @@ class TryOnStream:
         inputs = ((torch.cat([gamma, self.betas]) - regressor.centre) / regressor.size).clamp(-5, 5)
         latent, self.hidden = tryon.networks.regress(inputs, self.hidden)
         X = tryon.networks.decode(latent)
-        state = tryon.model.state(rotations, self.betas, translation)
-        return Frame(latent, X, tryon.model.posed(X, state))
+        return Frame(latent, X, self.pose(X, rotations, translation))
 
 
 def checked_shape(betas: Float[Tensor, "_"], body: Body) -> Float[Tensor, "K"]:

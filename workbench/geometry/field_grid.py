@@ -158,15 +158,15 @@ class FieldGrid:
         if count:
             low, (nx, ny, nz) = self.compact.low, self.compact.shape
             inputs = [
-                _shared(np.ascontiguousarray(points.numpy()), wp.vec3),
+                shared_array(np.ascontiguousarray(points.numpy()), wp.vec3),
                 wp.vec3(float(low[0]), float(low[1]), float(low[2])),
                 self.compact.root_size,
                 wp.vec3i(nx, ny, nz),
                 *self._warp_tree,
-                _shared(nodes, wp.int32, 2),
-                _shared(weights, wp.float32, 2),
-                _shared(local, wp.vec3),
-                _shared(size, wp.float32),
+                shared_array(nodes, wp.int32, 2),
+                shared_array(weights, wp.float32, 2),
+                shared_array(local, wp.vec3),
+                shared_array(size, wp.float32),
             ]
 
             def launch(start: int, stop: int) -> None:
@@ -177,7 +177,7 @@ class FieldGrid:
 
     @cached_property
     def _warp_tree(self) -> Any:
-        return _shared(self.child.numpy(), wp.int32), _shared(self.corner.numpy(), wp.int32, 2)
+        return shared_array(self.child.numpy(), wp.int32), shared_array(self.corner.numpy(), wp.int32, 2)
 
     @cached_property
     def _double_values(self) -> Tensor:
@@ -210,7 +210,8 @@ class _Lookup(torch.autograd.Function):
         return gradient.masked_fill(outside, 0.0), None
 
 
-def _shared(array: np.ndarray, dtype: Any, ndim: int = 1) -> wp.array:
+def shared_array(array: np.ndarray, dtype: Any, ndim: int = 1) -> wp.array:
+    """Warp's view of the same memory."""
     return wp.array(array, dtype=dtype, ndim=ndim, device="cpu", copy=False)
 
 
