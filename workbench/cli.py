@@ -135,6 +135,23 @@ def train(words: list[str]) -> int:
     return DONE
 
 
+def fit(words: list[str]) -> int:
+    from workbench.points.fit_command import FitScanConfig, run
+
+    config = parsed(FitScanConfig, "workbench fit", words)
+    run(config)
+    say(f"written: {config.out}; next: workbench animate {config.out} --motion FILE --out DIR")
+    return DONE
+
+
+def animate(words: list[str]) -> int:
+    from workbench.points.animate_command import AnimateConfig, run
+
+    written = run(parsed(AnimateConfig, "workbench animate", words))
+    say(f"written: {', '.join(map(str, written))}")
+    return DONE
+
+
 def export(words: list[str]) -> int:
     from workbench.export import ExportConfig, run
 
@@ -176,6 +193,8 @@ COMMANDS = {
         evaluate, f"{'|'.join(EVALUATIONS)} [--json FILE]", "the figures of a stage, with their bounds"
     ),
     "train": Command(train, "|".join(TRAININGS), "train a stage; a run that was ended continues"),
+    "fit": Command(fit, "SCAN --out DIR", "fit the points model to a scan of an outfit that no training saw"),
+    "animate": Command(animate, "FIT --motion FILE --out DIR", "the fitted outfit through any motion, as points"),
     "export": Command(export, "SEQUENCE.npz --out PATH", "a sequence as .glb, .npz, OBJ, PLY or PC2"),
     "doctor": Command(doctor, "", "what this machine has and lacks, with the command that mends it"),
 }

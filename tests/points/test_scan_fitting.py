@@ -39,24 +39,29 @@ def test_a_cloud_of_the_model_s_own_is_found_again(body, small_model, trained_li
         cloud = model(atlas_of(body, 32).map_of(bodies.neutral), torch.tensor([1]), posed)
     scan = ScanFrame(cloud.points[0], cloud.normals[0])
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    fitted, _ = fit_scan(model, body, scan, bodies, CONFIG, name="own")
+    fitted, _ = fit_scan(model, body, scan, bodies, CONFIG, betas=body.mean_shape(), name="own")
     assert fitted.loss_after < 0.7 * fitted.loss_before
     assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
     assert all(parameter.requires_grad for parameter in model.parameters())
-    again, _ = fit_scan(model, body, scan, bodies, CONFIG, name="own")
+    again, _ = fit_scan(model, body, scan, bodies, CONFIG, betas=body.mean_shape(), name="own")
     assert torch.equal(again.G, fitted.G)
     fitted.save(tmp_path / "f.npz")
     read = FittedOutfit.load(tmp_path / "f.npz")
     assert (read.name, read.loss_after) == ("own", fitted.loss_after)
     torch.testing.assert_close(features_of(model, read), features_of(model, fitted), atol=1e-2, rtol=1e-2)
+    assert torch.equal(read.betas, body.mean_shape())
+    with torch.no_grad():
+        model.decoder.to_normal.bias += 1
+    with pytest.raises(ValueError, match="was fitted with other networks"):
+        features_of(model, read)
 
 
 def test_a_scan_that_is_elsewhere_is_refused(body, small_model):
     bodies = frame_of(body)
     skin = skin_of(body, bodies)
     away = ScanFrame(skin.points + torch.tensor([0.0, 0.0, 0.9]), skin.normals)
-    with pytest.raises(ValueError, match=r"the body lies \d+ cm off the scan .*give the pose, shape and place"):
-        fit_scan(small_model, body, away, bodies, CONFIG)
+    with pytest.raises(ValueError, match=r"the body lies \d+ cm off the scan .*: with --place it"):
+        fit_scan(small_model, body, away, bodies, CONFIG, betas=body.mean_shape())
 
 
 def test_skinning_a_scan_of_the_bare_body_gives_the_posed_body(body):

@@ -56,6 +56,7 @@ class Scan:
     normals: Float32[ndarray, "N 3"]
     name: str = "scan"
     remarks: tuple[str, ...] = ()
+    estimated: bool = False  # the normals are guesses: their signs may be wrong in places
 
     def __len__(self) -> int:
         return len(self.points)
@@ -123,7 +124,11 @@ def require_person_sized(points: Float[ndarray, "N 3"], name: str, unit: Unit = 
         return
     raw = extent / UNITS[unit]
     likely = [other for other, scale in UNITS.items() if SHORTEST <= raw * scale <= TALLEST]
-    remedy = f"it looks like {likely[0]}: pass unit='{likely[0]}'" if likely else "expected a person, 0.5 to 2.8 m"
+    remedy = (
+        f"it looks like {likely[0]}: pass unit='{likely[0]}' (--unit {likely[0]})"
+        if likely
+        else "expected a person, 0.5 to 2.8 m"
+    )
     raise ValueError(f"{name} is {raw:.3g} {unit} large; {remedy}")
 
 
@@ -131,7 +136,9 @@ def require_upright(points: Float[ndarray, "N 3"], name: str) -> None:
     """Raises ValueError where a cloud is so much deeper than tall that its up axis must be y."""
     _, deep, tall = np.ptp(points, axis=0)
     if deep > LYING * tall:
-        raise ValueError(f"{name} is {tall:.2f} m tall (z) and {deep:.2f} m deep (y); it looks y-up: pass up='y'")
+        raise ValueError(
+            f"{name} is {tall:.2f} m tall (z) and {deep:.2f} m deep (y); it looks y-up: pass up='y' (--up y)"
+        )
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
@@ -169,7 +176,7 @@ def _made_of(path: Path, cloud: _Cloud, count: int, generator: np.random.Generat
             sampled.point, sampled.normal, path.stem, (f"{count} points were sampled on the mesh of {path.name}",)
         )
     remark = f"{path.name} has no normals: they were estimated from the points, outside guessed from the topmost one"
-    return Scan(cloud.points.astype(np.float32), estimate_normals(cloud.points), path.stem, (remark,))
+    return Scan(cloud.points.astype(np.float32), estimate_normals(cloud.points), path.stem, (remark,), estimated=True)
 
 
 def _z_up(vectors: Float32[ndarray, "N 3"], up: Axis) -> Float32[ndarray, "N 3"]:
@@ -235,7 +242,7 @@ def _ply_table(
             raise ValueError(f"{path} is damaged: {error}") from error
         if numbers.shape != (count, len(columns)) and count:
             raise ValueError(f"{path} is damaged: {len(numbers)} rows of vertices, expected {count}")
-        return {name: numbers.reshape(count, -1)[:, k] for k, (name, _) in enumerate(columns)}
+        return {name: numbers.reshape(count, len(columns))[:, k] for k, (name, _) in enumerate(columns)}
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding)
     if order is None:
         raise ValueError(f"{path}: unknown PLY format {encoding!r}")

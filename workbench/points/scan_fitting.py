@@ -3,6 +3,7 @@
 The pose does not change during a fit, so P is computed once; only G moves, and a step decodes random pixels.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.geometry.chamfer import NearestPoint, match
+from workbench.geometry.chamfer import match
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.npz import read_npz
@@ -36,10 +37,10 @@ from workbench.points.uv_position_map import (
     atlas_of,
     posed_queries,
 )
+from workbench.points.worn_scan import require_aligned
 from workbench.store import atomic_write
 
-FARTHEST = 0.08  # metres that the body's surface may lie off the scan, at the median, before it is called misaligned
-FORMAT = "fitted-outfit-1"
+FORMAT = "fitted-outfit-2"
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,12 @@ class ScanFitConfig:
 
 @dataclass(frozen=True, eq=False)
 class FittedOutfit:
-    """What a scan wears: G, and the loss of Eq. 3 over all of the scan before and after."""
+    """What a scan wears: G, for these networks and no others; Eq. 3 over all of the scan before and after."""
 
     name: str
     G: Float[Tensor, "1 c H W"]
+    betas: Float[Tensor, " K"]  # of who wears it
+    networks: str  # `networks_fingerprint`
     loss_before: float
     loss_after: float
 
@@ -75,17 +78,26 @@ class FittedOutfit:
                 format=np.array(FORMAT),
                 name=np.array(self.name),
                 G=self.G.numpy().astype(np.float16),
+                betas=self.betas.numpy(),
+                networks=np.array(self.networks),
                 losses=np.array([self.loss_before, self.loss_after]),
             )
 
     @staticmethod
     def load(path: str | Path) -> "FittedOutfit":
         """Raises FileNotFoundError, or ValueError for another file."""
-        arrays = read_npz(path, "a fitted outfit", required=("format", "name", "G", "losses"))
+        arrays = read_npz(path, "a fitted outfit", required=("format", "name", "G", "betas", "networks", "losses"))
         if str(arrays["format"]) != FORMAT:
             raise ValueError(f"{path} has format {str(arrays['format'])!r}; expected {FORMAT!r}")
         before, after = (float(loss) for loss in arrays["losses"])
-        return FittedOutfit(str(arrays["name"]), torch.from_numpy(arrays["G"]).float(), before, after)
+        return FittedOutfit(
+            name=str(arrays["name"]),
+            G=torch.from_numpy(arrays["G"]).float(),
+            betas=torch.from_numpy(arrays["betas"]).float(),
+            networks=str(arrays["networks"]),
+            loss_before=before,
+            loss_after=after,
+        )
 
 
 def fit_scan(
@@ -95,12 +107,13 @@ def fit_scan(
     bodies: PosedBodies,
     config: ScanFitConfig = ScanFitConfig(),
     *,
+    betas: Float[Tensor, " K"],
     name: str = "scan",
     watch: Callable[[int, float], None] | None = None,
 ) -> tuple[FittedOutfit, FitResult]:
     """argmin_G L_total(Y)      (Eq. 7), from the mean of the trained G.
 
-    scan, bodies: one frame in the pelvis frame; the model is in evaluation mode and is not changed.
+    scan, bodies, betas: one frame in the pelvis frame; the model is in evaluation mode and is not changed.
     Raises ValueError where the body does not lie in the scan.
     """
     require_aligned(scan, bodies)
@@ -137,27 +150,29 @@ def fit_scan(
         before = whole_loss()
         generator = torch.Generator().manual_seed(config.seed)
         result = fit([G], loss_of, config.fit, generator=generator, label=f"fit {name}", watch=watch)
-        return FittedOutfit(name, G.detach(), before, whole_loss()), result
+        fitted = FittedOutfit(name, G.detach(), betas, networks_fingerprint(model), before, whole_loss())
+        return fitted, result
     finally:
         model.requires_grad_(True)
 
 
-def require_aligned(scan: ScanFrame, bodies: PosedBodies) -> None:
-    """Raises ValueError unless most of the body lies near the scan: points cannot tell a body from its clothes."""
-    if len(bodies) != 1:
-        raise ValueError(f"a scan has one body, got {len(bodies)}")
-    surface = bodies.vertices[0].numpy()
-    nearest = scan.points[torch.from_numpy(NearestPoint(scan.points.numpy())(surface))]
-    off = float((bodies.vertices[0] - nearest).norm(dim=1).median())
-    if off > FARTHEST:
-        raise ValueError(
-            f"the body lies {100 * off:.0f} cm off the scan (median; expected at most {100 * FARTHEST:.0f} cm): "
-            "give the pose, shape and place of the body in this scan"
-        )
+def networks_fingerprint(model: PointModel) -> str:
+    """A hash of all that is shared by outfits: G means nothing to other networks."""
+    digest = hashlib.sha256()
+    for key, tensor in sorted(model.state_dict().items()):
+        if key != "geometry.stored":
+            digest.update(key.encode() + tensor.detach().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def features_of(model: PointModel, fitted: FittedOutfit) -> Float[Tensor, "1 c H W"]:
-    """The smoothed features of a fitted outfit: what `PointModel.dress` reads."""
+    """What `PointModel.dress` reads of a fitted outfit.  ValueError for one that was fitted with other networks."""
+    own = networks_fingerprint(model)
+    if fitted.networks != own:
+        raise ValueError(
+            f"outfit {fitted.name!r} was fitted with other networks ({fitted.networks}; these are {own}): "
+            "give the model it was fitted with (--model), or fit its scan again"
+        )
     with torch.no_grad():
         return model.geometry.smooth(fitted.G)
 
