@@ -7,16 +7,19 @@ import torch
 
 from workbench.collisions.motion_descriptor import (
     DESCRIPTOR_SIZE,
+    EULER_ORDER,
     DescriptorStream,
     PoseDescriptor,
     backward_difference,
     descriptor,
     global_motion,
+    heading_tilt_roll,
     pose_input,
     settled_acceleration,
+    turn_about_z,
     unwrapped,
 )
-from workbench.geometry.rotations import axis_angle_to_matrix
+from workbench.geometry.rotations import axis_angle_to_matrix, euler_to_matrix, matrix_to_euler
 
 FPS = 30.0
 T, JOINTS = 20, 6
@@ -96,3 +99,14 @@ def test_the_stream_gives_what_the_whole_motion_gives():
         stream = DescriptorStream(describe, FPS)
         each = torch.stack([stream(r, h) for r, h in zip(rotations, translation, strict=True)])
     torch.testing.assert_close(each, whole, atol=2e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("tilt", [0.3, math.pi / 2, -math.pi / 2])  # the last two lock the gimbal
+def test_two_ways_to_the_angles_agree(tilt):
+    angles = torch.tensor([2.5, tilt, 0.0 if abs(tilt) > 1.5 else -1.2], dtype=torch.float64)
+    R = euler_to_matrix(angles, EULER_ORDER)
+    found = torch.tensor(heading_tilt_roll(R.tolist()), dtype=torch.float64)
+    torch.testing.assert_close(found, matrix_to_euler(R, EULER_ORDER))
+    torch.testing.assert_close(euler_to_matrix(found, EULER_ORDER), R, atol=1e-6, rtol=0)
+    turned = torch.tensor(turn_about_z(2.5), dtype=torch.float64)
+    torch.testing.assert_close(turned, euler_to_matrix(torch.tensor([2.5, 0, 0], dtype=torch.float64), EULER_ORDER))

@@ -128,8 +128,8 @@ class TablePoser(FramePoser):
             shared_array(rest, wp.vec3),
             shared_array(self.rotations, wp.mat33),
             shared_array(self.translation, wp.vec3),
-            wp.empty(joints, dtype=wp.mat33, device="cpu"),
-            wp.empty(joints, dtype=wp.vec3, device="cpu"),
+            shared_array(np.empty((joints, 3, 3), np.float32), wp.mat33),
+            shared_array(np.empty((joints, 3), np.float32), wp.vec3),
             shared_array(self.transforms, wp.float32, 2),
         )
         grid = fields.grid.compact

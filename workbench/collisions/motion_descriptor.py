@@ -8,8 +8,10 @@ gamma does not depend on where the body stands and faces; theta_bar also sees th
 frame, which the paper's gamma lacks although a leaning body's garment hangs differently.
 """
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -110,33 +112,54 @@ def descriptor(pose: Float[Tensor, "*B T P"], moving: Float[Tensor, "*B T 12"], 
 
 
 class DescriptorStream:
-    """gamma frame by frame: what `descriptor` and `global_motion` give for a whole motion, without its future."""
+    """gamma frame by frame: what `descriptor` and `global_motion` give for a whole motion, without its future.
+
+    In numpy: of so few numbers, torch's calls would take longer than the work.
+    """
 
     def __init__(self, describe: PoseDescriptor, fps: float):
-        self.describe, self.fps, self.frame = describe, fps, 0
-        zero = torch.zeros(3)
-        self.last = {"pose": torch.zeros(POSE_SIZE), "translation": zero, "angles": zero}
-        self.last_velocity = {name: torch.zeros_like(value) for name, value in self.last.items()}
+        self.fps, self.frame = fps, 0
+        parameters = (describe.hidden.weight, describe.hidden.bias, describe.out.weight, describe.out.bias)
+        self.parameters = [parameter.detach().numpy() for parameter in parameters]
+        self.identity = np.eye(3, dtype=np.float32)
+        # theta_bar, H, K's angles of the last frame
+        self.last = np.zeros(POSE_SIZE + 6, np.float32)
+        self.last_velocity = np.zeros_like(self.last)
 
     def __call__(self, rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]) -> Float[Tensor, "D"]:
         """gamma of the next frame."""
-        pose = self.describe(rotations)
-        angles = matrix_to_euler(rotations[0], EULER_ORDER)
+        R = rotations.numpy()
+        hidden, hidden_bias, out, out_bias = self.parameters
+        seen = np.concatenate([(R[1:] - self.identity).ravel(), -R[0, 2]])
+        pose = out @ np.maximum(hidden @ seen + hidden_bias, 0) + out_bias
+        angles = np.array(heading_tilt_roll(R[0].tolist()), np.float32)
         if self.frame:
-            angles = angles - 2 * torch.pi * torch.round((angles - self.last["angles"]) / (2 * torch.pi))
-        rates = [
-            self._rates(name, value)
-            for name, value in (("pose", pose), ("translation", translation), ("angles", angles))
+            angles -= 2 * np.pi * np.round((angles - self.last[-3:]) / (2 * np.pi))
+        now = np.concatenate([pose, translation.numpy(), angles])
+        velocity = (now - self.last) * self.fps if self.frame else np.zeros_like(now)
+        acceleration = (velocity - self.last_velocity) * self.fps if self.frame > 1 else np.zeros_like(now)
+        self.last, self.last_velocity, self.frame = now, velocity, self.frame + 1
+        facing = np.array(turn_about_z(float(angles[0])), np.float32)
+        gamma = [pose, velocity[:POSE_SIZE], acceleration[:POSE_SIZE]]
+        gamma += [
+            velocity[POSE_SIZE:-3] @ facing,
+            acceleration[POSE_SIZE:-3] @ facing,
+            velocity[-3:],
+            acceleration[-3:],
         ]
-        (pose_rates, (velocity, acceleration), turning) = rates
-        facing = axis_angle_to_matrix(torch.stack([angles.new_zeros(()), angles.new_zeros(()), angles[0]]))
-        self.frame += 1
-        return torch.cat([pose, *pose_rates, velocity @ facing, acceleration @ facing, *turning])
+        return torch.from_numpy(np.concatenate(gamma))
 
-    def _rates(self, name: str, value: Tensor) -> tuple[Tensor, Tensor]:
-        velocity = (value - self.last[name]) * self.fps if self.frame else torch.zeros_like(value)
-        acceleration = (velocity - self.last_velocity[name]) * self.fps
-        if self.frame < 2:
-            acceleration = torch.zeros_like(value)
-        self.last[name], self.last_velocity[name] = value, velocity
-        return velocity, acceleration
+
+def heading_tilt_roll(R: list[list[float]]) -> tuple[float, float, float]:
+    """`matrix_to_euler` of one matrix in EULER_ORDER."""
+    level = math.hypot(R[2][2], R[2][0])
+    tilt = math.atan2(R[2][1], level)
+    if level < 1e-6:
+        return math.atan2(R[1][0], R[0][0]), tilt, 0.0
+    return math.atan2(-R[0][1], R[1][1]), tilt, math.atan2(-R[2][0], R[2][2])
+
+
+def turn_about_z(angle: float) -> list[list[float]]:
+    """The rotation matrix."""
+    c, s = math.cos(angle), math.sin(angle)
+    return [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]

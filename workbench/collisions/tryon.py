@@ -198,8 +198,15 @@ class TryOnStream:
 
     @torch.no_grad()
     def __call__(self, rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]) -> Frame:
-        """The next frame, at the networks' frame rate."""
+        """The next frame, at the networks' frame rate.
+
+        Errors: ValueError for another skeleton, NaN or infinity; the stream is then as it was before the frame.
+        """
         tryon = self.tryon
+        if len(rotations) != tryon.regressor.joints:
+            raise ValueError(f"the frame has {len(rotations)} joints, but the networks {tryon.regressor.joints}")
+        if not (bool(torch.isfinite(rotations).all()) and bool(torch.isfinite(translation).all())):
+            raise ValueError(f"frame {self.describe.frame} holds NaN or infinity; leave it out or repeat the last one")
         gamma = self.describe(rotations, translation)
         regressor = tryon.regressor
         inputs = ((torch.cat([gamma, self.betas]) - regressor.centre) / regressor.size).clamp(-5, 5)
