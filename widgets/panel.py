@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from widgets.live import LiveScene
 
 SIZE = (760, 560)  # pixels of the scene
+ROOM, HEIGHT = 1080, 500  # pixels that a notebook has beside the controls; height where views stand side by side
 PLOT_SHARE = 0.42  # of a picture's width, where a plot stands beside the scene
 OVERSAMPLING = 1  # of the PNG beside a live view: it is seen only where there is no live one
 
@@ -53,13 +54,13 @@ class Panel:
         size: tuple[int, int] = SIZE,
     ):
         self.groups, self.title, self.size, self.plot = tuple(groups), title, size, plot
-        self._controls = controls_of(groups)
+        self.controls: dict[str, Any] = dict(controls_of(groups))
         self._compute, self._read = scene, readout
         self._lock, self._asked, self._held = threading.RLock(), False, 0
         self._frame = 0
         self.scene = scene()
         self.readout = readout()
-        for control in self._controls.values():
+        for control in self.controls.values():
             if isinstance(control, Control):
                 control.listen(self._follow)
 
@@ -73,7 +74,7 @@ class Panel:
 
     def press(self, name: str) -> None:
         """Press a button."""
-        button = self._controls.get(name)
+        button = self.controls.get(name)
         if not isinstance(button, Button):
             raise KeyError(f"there is no button {name!r}; there are: {', '.join(self._names(Button)) or 'none'}")
         button.press()
@@ -207,13 +208,13 @@ class Panel:
         return None
 
     def _control(self, name: str) -> Control:
-        control = self._controls.get(name)
+        control = self.controls.get(name)
         if not isinstance(control, Control):
             raise KeyError(f"there is no control {name!r}; there are: {', '.join(self._names(Control)) or 'none'}")
         return control
 
     def _names(self, kind: type) -> list[str]:
-        return [name for name, item in self._controls.items() if isinstance(item, kind)]
+        return [name for name, item in self.controls.items() if isinstance(item, kind)]
 
 
 class _Held:
@@ -227,6 +228,11 @@ class _Held:
         self.panel._held -= 1
         if self.panel._asked:
             self.panel._follow()
+
+
+def size_for(views: int) -> tuple[int, int]:
+    """Pixels for some views side by side: a body is higher than wide."""
+    return (SIZE[0] if views <= 2 else ROOM, SIZE[1] if views <= 2 else HEIGHT)
 
 
 def _line(text: str) -> str:

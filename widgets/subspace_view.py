@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from widgets.controls import Button, Group, Number, latent_sliders, seed_slider
-from widgets.panel import SIZE, Panel
+from widgets.panel import Panel, size_for
 from widgets.scene import CLOTH, SKIN, Mesh, Points, Scalars, Scene, View, camera_of
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF, GridSDF
@@ -65,7 +65,8 @@ def subspace_view(subspace: Subspace, *others: Subspace, names: tuple[str, ...] 
     between = Number("A to B", 0.0, 0.0, 1.0, 0.02, "the straight way between two latents")
     ends = {"A": latent.value, "B": _random(1)}
     now: list[Decoded] = []
-    aspect = SIZE[0] / len(shown) / SIZE[1]
+    size = size_for(len(shown))
+    aspect = size[0] / len(shown) / size[1]
     camera = camera_of([Points(garment.vertices.numpy())], margin=AROUND, aspect=aspect)
 
     def scene() -> Scene:
@@ -131,6 +132,7 @@ def subspace_view(subspace: Subspace, *others: Subspace, names: tuple[str, ...] 
         scene,
         readout,
         title=f"Subspace of {subspace.garment_name!r}",
+        size=size,
     )
     return panel
 

@@ -31,7 +31,7 @@ def test_both_skinnings_are_those_of_the_body(body, panel):
     panel["joint"] = "RightUpLeg"
     panel["theta"] = (40.0, -10.0, 20.0)
     rotations = axis_angle_to_matrix(torch.zeros(len(body.parents), 3))
-    for joint, degrees in (("LeftForeArm", panel._controls["theta"].start), ("RightUpLeg", (40.0, -10.0, 20.0))):
+    for joint, degrees in (("LeftForeArm", panel.controls["theta"].start), ("RightUpLeg", (40.0, -10.0, 20.0))):
         rotations[body.joint_names.index(joint)] = axis_angle_to_matrix(torch.deg2rad(torch.tensor(degrees)))
     linear, dual = meshes(panel)
     betas = torch.tensor(panel["beta"])
