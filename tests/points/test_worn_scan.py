@@ -95,7 +95,7 @@ def test_units_axes_and_nan_are_told(files, body):
     with pytest.raises(ValueError, match="unit='mm'"):
         read_worn_scan(source(files, file=files / "mm.ply"), body)
     assert len(read_worn_scan(source(files, file=files / "mm.ply", unit="mm"), body).scan.points)
-    swapped = world.points[:, [0, 2, 1]] * np.float32([1, 1, -1])
+    swapped = world.points[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
     write_scan(files / "y.ply", Scan(swapped, world.normals))
     with pytest.raises(ValueError, match=r"with --up y it would lie \d\.\d cm off"):
         read_worn_scan(source(files, file=files / "y.ply"), body)

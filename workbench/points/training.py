@@ -185,10 +185,7 @@ def train_points(
     places = atlas_of(scans.body, config.query_size).queries if queries is None else queries
 
     def loss_of(step: int, generator: torch.Generator) -> Tensor:
-        batch, posed = _drawn(scans, places, config, generator)
-        with autocast(config.precision):
-            cloud = model(batch.position_map, batch.outfit, posed)
-        return cloud_terms(cloud, batch.scans, model.penalised()).total(weights_at(step, config))
+        return step_loss(model, scans, places, config, step, generator)
 
     _train_mode(model, training=True)
     generator = torch.Generator().manual_seed(config.seed)
@@ -203,6 +200,21 @@ def train_points(
     )
     settle(model, scans, places, config)
     return result
+
+
+def step_loss(
+    model: ClothesModel,
+    scans: ScanSet,
+    places: SurfaceQueries,
+    config: PointTrainingConfig,
+    step: int,
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """Eq. 3 on frames, pixels and scan points drawn from `generator`."""
+    batch, posed = _drawn(scans, places, config, generator)
+    with autocast(config.precision):
+        cloud = model(batch.position_map, batch.outfit, posed)
+    return cloud_terms(cloud, batch.scans, model.penalised()).total(weights_at(step, config))
 
 
 def settle(model: ClothesModel, scans: ScanSet, places: SurfaceQueries, config: PointTrainingConfig) -> None:

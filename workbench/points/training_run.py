@@ -64,18 +64,19 @@ class TrainPointsConfig:
 
 
 def run(config: TrainPointsConfig) -> tuple[Path, ...]:
-    """Train (or continue); returns the model files: `out`/METHOD.safetensors, or `out`/METHOD-OUTFIT.safetensors.
+    """Train (or continue); returns the model files: `out`/METHOD[-everyN][-OUTFIT].safetensors.
 
     Raises ValueError for a folder without scans, outfits that it lacks, or a step count of a run that differs.
     """
     body = Body.default()
     scans = chosen(load_scans(training_folder(config.data)), config)
+    name = config.method if config.every == 1 else f"{config.method}-every{config.every}"
     if not (config.per_outfit or config.method == "patches"):
-        return (train_one(scans, config, body, config.method),)
+        return (train_one(scans, config, body, name),)
     written = []
     for outfit in outfits_of(scans):
         own = [scan for scan in scans if scan.outfit == outfit]
-        written.append(train_one(own, config, body, f"{config.method}-{outfit}"))
+        written.append(train_one(own, config, body, f"{name}-{outfit}"))
     return tuple(written)
 
 
