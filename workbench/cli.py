@@ -30,6 +30,7 @@ EVALUATIONS = {
     "subspace": ("workbench.collisions.subspace_evaluation", "SubspaceEvaluation"),
     "collisions": ("workbench.collisions.collision_evaluation", "CollisionEvaluation"),
     "runtime": ("workbench.collisions.runtime_evaluation", "RuntimeEvaluation"),
+    "points": ("workbench.points.points_evaluation", "PointsEvaluation"),
 }
 # `workbench train STAGE`: where its config class and its `run(config)` are
 TRAININGS = {
