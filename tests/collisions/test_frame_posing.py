@@ -77,6 +77,19 @@ def test_it_never_holds_more_rows_than_the_table(body, model):
     assert sorted(numbered) == list(range(nodes.leaf_count))
 
 
+def test_a_cell_between_known_ones_needs_no_new_rows(body, model):
+    _, _, betas = random_pose(body, 10)
+    nodes = TablePoser(body, model.fields, betas, 1).nodes
+    cell = model.fields.grid.locate(Garment.load("tshirt").vertices[:1]).nodes[0].numpy()
+    corners = model.fields.grid.corner.numpy()
+    last = int(np.flatnonzero((corners == cell).all(1) & (nodes.child == -1))[0])
+    around = np.flatnonzero(np.isin(corners, cell).any(1) & (nodes.child == -1))
+    nodes.add(around[around != last])
+    rows = nodes.row_count
+    nodes.add(np.array([last]))
+    assert nodes.row_count == rows
+
+
 def test_other_fields_go_through_the_model(body, analytic_fields):
     rotations, translation, betas = random_pose(body, 8)
     model = GarmentModel(body, analytic_fields(body))

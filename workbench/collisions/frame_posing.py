@@ -18,9 +18,11 @@ from workbench.body.model import Body
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.posing_kernels import LANES, TRIPLES, find_leaves, joint_transforms, pose_points
+from workbench.geometry.closest_point import morton_order
 from workbench.geometry.field_grid import shared_array
 
-ROWS_INPUT = 3  # of `pose_points`: corners, then rows
+ROWS_INPUT = 4  # of `pose_points`: corners, then weights, then offsets
+CODES = 32767  # the largest integer of 16 bits
 
 
 class FramePoser(ABC):
@@ -46,19 +48,25 @@ class ModelPoser(FramePoser):
 
 
 class NodeRows:
-    """The rows of those nodes of the table that were asked for, B~s contracted with beta, in whole chunks.
+    """The rows of those nodes of the table that were asked for, in whole chunks.
 
+    W~; B~s, contracted with beta, beside the directions of B~p, as integers of 16 bits times a step each (an
+    error of a few micrometres at most).
     Grows by need; it never holds more rows than the table has nodes.
     """
 
     def __init__(self, fields: GridFields, betas: Float[Tensor, "K"]):
         self.fields, self.betas = fields, betas
-        layout = fields.layout
-        self.weight_chunks = -(-layout.joints // LANES)
+        layout, grid = fields.layout, fields.grid
         self.offset_chunks = -(-(1 + layout.poses) // TRIPLES)
-        self.child = fields.grid.child.numpy().copy()  # of a leaf: -1, or -2 - its number here
-        self.place = np.full(len(fields.grid.values), -1, np.int32)  # of a node's row here
-        self.rows = np.empty((0, LANES * (self.weight_chunks + self.offset_chunks)), np.float32)
+        largest = layout.split(grid.largest[None])
+        shape = torch.einsum("k,nki->ni", betas.abs(), largest.shape_directions)
+        highest = torch.cat([shape[:, None], largest.pose_directions], dim=1).amax(-1)[0]
+        self.step = (highest.clamp_min(1e-9) / CODES).numpy()  # of a displacement, metres
+        self.child = grid.child.numpy().copy()  # of a leaf: -1, or -2 - its number here
+        self.place = np.full(len(grid.values), -1, np.int32)  # of a node's row here
+        self.weights = np.empty((0, LANES * -(-layout.joints // LANES)), np.float32)
+        self.offsets = np.empty((0, LANES * self.offset_chunks), np.int16)
         self.corners = np.empty((0, 8), np.int32)  # rows of a numbered leaf
         self.row_count = self.leaf_count = 0
 
@@ -67,21 +75,20 @@ class NodeRows:
         nodes = self.fields.grid.corner.numpy()[cells]
         new = np.unique(nodes[self.place[nodes] < 0])
         rows, leaves = self.row_count + len(new), self.leaf_count + len(cells)
-        self.rows, self.corners = _with_room(self.rows, rows), _with_room(self.corners, leaves)
-        self.rows[self.row_count : rows] = self._read(new)
+        self.weights, self.offsets = _with_room(self.weights, rows), _with_room(self.offsets, rows)
+        self.corners = _with_room(self.corners, leaves)
+        values = self.fields.layout.split(self.fields.grid.values[torch.from_numpy(new).long()])
+        self.weights[self.row_count : rows] = 0
+        self.weights[self.row_count : rows, : self.fields.layout.joints] = values.weights.numpy()
+        shape = torch.einsum("k,nki->ni", self.betas, values.shape_directions)
+        offsets = torch.cat([shape[:, None], values.pose_directions], dim=1).numpy() / self.step[:, None]
+        self.offsets[self.row_count : rows] = in_chunks(
+            np.rint(offsets).reshape(len(new), 3 * len(self.step)), self.offset_chunks
+        )
         self.place[new] = np.arange(self.row_count, rows, dtype=np.int32)
         self.corners[self.leaf_count : leaves] = self.place[nodes]
         self.child[cells] = -2 - np.arange(self.leaf_count, leaves, dtype=np.int32)
         self.row_count, self.leaf_count = rows, leaves
-
-    def _read(self, nodes: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n C"]:
-        values = self.fields.layout.split(self.fields.grid.values[torch.from_numpy(nodes).long()])
-        rows = np.zeros((len(nodes), self.rows.shape[1]), np.float32)
-        rows[:, : self.fields.layout.joints] = values.weights.numpy()
-        shape = torch.einsum("k,nki->ni", self.betas, values.shape_directions)
-        offsets = torch.cat([shape[:, None], values.pose_directions], dim=1).flatten(1)
-        rows[:, LANES * self.weight_chunks :] = in_chunks(offsets.numpy(), self.offset_chunks)
-        return rows
 
 
 def in_chunks(triples: Float[np.ndarray, "n C"], chunks: int) -> Float[np.ndarray, "n D"]:
@@ -107,63 +114,40 @@ class TablePoser(FramePoser):
     """By the table and one kernel; float32 on the CPU."""
 
     def __init__(self, body: Body, fields: GridFields, betas: Float[Tensor, "K"], points: int):
-        joints = len(body.parents)
-        self.nodes = NodeRows(fields, betas)
-        self.rotations = np.empty((joints, 3, 3), np.float32)
-        self.translation = np.empty((1, 3), np.float32)
+        joints, self.nodes = len(body.parents), NodeRows(fields, betas)
+        self.order = np.empty(points, np.int32)  # of the first garment along a Morton curve: neighbours share rows
+        self.fresh = True
+        self.rotations, self.translation = np.empty((joints, 3, 3), np.float32), np.empty((1, 3), np.float32)
         self.points, self.posed = np.empty((points, 3), np.float32), np.empty((points, 3), np.float32)
-        self.unknown, self.unknown_count = np.empty(points, np.int32), np.zeros(1, np.int32)
+        self.leaf = np.empty(points, np.int32)
         # B~s counts once, and each pose direction as much as the pose says
-        pose_map = np.repeat(body.pose_map.numpy(), 3, axis=1)
-        self.factor_map = in_chunks(np.pad(pose_map, ((0, 0), (3, 0))), self.nodes.offset_chunks)
-        self.factor_rest = in_chunks(np.ones((1, 3), np.float32), self.nodes.offset_chunks)[0]
+        step = np.repeat(self.nodes.step, 3)
+        pose_map = np.pad(np.repeat(body.pose_map.numpy(), 3, axis=1), ((0, 0), (3, 0))) * step
+        self.factor_map = in_chunks(pose_map, self.nodes.offset_chunks)
+        self.factor_rest = in_chunks(step[None, :3], self.nodes.offset_chunks)[0]
         self.factors = self.factor_rest.copy()
-        self.transforms = np.zeros((LANES * self.nodes.weight_chunks, LANES), np.float32)
-        local, leaf = np.empty((points, 3), np.float32), np.empty(points, np.int32)
-        rest = np.ascontiguousarray(body.joints(betas).numpy())
+        self.transforms = np.zeros((self.nodes.weights.shape[1], LANES), np.float32)
+        local = shared_array(np.empty((points, 3), np.float32), wp.vec3)
+        leaf = shared_array(self.leaf, wp.int32)
+        order, X = shared_array(self.order, wp.int32), shared_array(self.points, wp.vec3)
+        transforms = shared_array(self.transforms, wp.float32, 2)
         self._skeleton = Recorded(
             joint_transforms,
             1,
             shared_array(np.array(body.parents, np.int32), wp.int32),
-            shared_array(rest, wp.vec3),
+            shared_array(np.ascontiguousarray(body.joints(betas).numpy()), wp.vec3),
             shared_array(self.rotations, wp.mat33),
             shared_array(self.translation, wp.vec3),
             shared_array(np.empty((joints, 3, 3), np.float32), wp.mat33),
             shared_array(np.empty((joints, 3), np.float32), wp.vec3),
-            shared_array(self.transforms, wp.float32, 2),
+            transforms,
         )
         grid = fields.grid.compact
-        shared_points, shared_leaf, shared_local = (
-            shared_array(self.points, wp.vec3),
-            shared_array(leaf, wp.int32),
-            shared_array(local, wp.vec3),
-        )
-        self._leaves = Recorded(
-            find_leaves,
-            points,
-            shared_points,
-            wp.vec3(*(float(x) for x in grid.low)),
-            grid.root_size,
-            wp.vec3i(*grid.shape),
-            shared_array(self.nodes.child, wp.int32),
-            shared_leaf,
-            shared_local,
-            shared_array(self.unknown, wp.int32),
-            shared_array(self.unknown_count, wp.int32),
-        )
-        self._pose = Recorded(
-            pose_points,
-            points,
-            shared_points,
-            shared_local,
-            shared_leaf,
-            *self._shared_rows(),
-            self.nodes.weight_chunks,
-            self.nodes.offset_chunks,
-            shared_array(self.transforms, wp.float32, 2),
-            shared_array(self.factors, wp.float32),
-            shared_array(self.posed, wp.vec3),
-        )
+        low, shape = wp.vec3(*(float(x) for x in grid.low)), wp.vec3i(*grid.shape)
+        child = shared_array(self.nodes.child, wp.int32)
+        self._leaves = Recorded(find_leaves, points, order, X, low, grid.root_size, shape, child, leaf, local)
+        factors, posed = shared_array(self.factors, wp.float32), shared_array(self.posed, wp.vec3)
+        self._pose = Recorded(pose_points, points, order, X, local, leaf, *self._rows(), transforms, factors, posed)
 
     def __call__(
         self, X: Float[Tensor, "N 3"], rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]
@@ -177,26 +161,34 @@ class TablePoser(FramePoser):
                 "mend the mesh before posing it"
             )
         self.points[:] = points
+        if self.fresh:
+            self.order[:], self.fresh = morton_order(self.points), False
         self.rotations[:], self.translation[0] = rotations.numpy(), translation.numpy()
         feature = (self.rotations[1:] - np.eye(3, dtype=np.float32)).reshape(-1)
         np.add(feature @ self.factor_map, self.factor_rest, out=self.factors)
         self._skeleton()
         self._leaves()
-        if self.unknown_count[0]:
+        if self.leaf.min(initial=0) < 0:
             self._learn()
         self._pose()
         return torch.from_numpy(self.posed.copy())
 
     def _learn(self) -> None:
         """Read the rows that this frame is the first to need."""
-        self.nodes.add(np.unique(self.unknown[: self.unknown_count[0]]))
-        self.unknown_count[0] = 0
-        self._leaves()
-        for index, array in enumerate(self._shared_rows()):
+        unknown = self.leaf < 0
+        cells = -1 - self.leaf[unknown]
+        self.nodes.add(np.unique(cells))
+        self.leaf[unknown] = -2 - self.nodes.child[cells]
+        for index, array in enumerate(self._rows()):
             self._pose.replace(ROWS_INPUT + index, array)
 
-    def _shared_rows(self) -> tuple[wp.array, wp.array]:
-        return shared_array(self.nodes.corners, wp.int32, 2), shared_array(self.nodes.rows, wp.float32, 2)
+    def _rows(self) -> tuple[wp.array, wp.array, wp.array]:
+        nodes = self.nodes
+        return (
+            shared_array(nodes.corners, wp.int32, 2),
+            shared_array(nodes.weights, wp.float32, 2),
+            shared_array(nodes.offsets, wp.int16, 2),
+        )
 
 
 class Recorded:

@@ -38,6 +38,7 @@ def joint_transforms(
 
 @wp.kernel
 def find_leaves(
+    order: wp.array(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     low: wp.vec3,
     root_size: float,
@@ -45,53 +46,61 @@ def find_leaves(
     child: wp.array(dtype=wp.int32),
     leaf: wp.array(dtype=wp.int32),
     local: wp.array(dtype=wp.vec3),
-    unknown: wp.array(dtype=wp.int32),
-    unknown_count: wp.array(dtype=wp.int32),
 ):
-    """The number of the leaf cell of each point (clamped to the box) and the local coordinates in [0, 1]^3.
+    """The number of the leaf cell and the local coordinates in [0, 1]^3 of the points order[0], order[1], ..., clamped
+    to the box.
 
     `child` holds the first child of a split cell, -2 - number of a leaf, or -1 for a leaf that has no number yet;
-    those are listed."""
-    n = wp.tid()
-    x = (points[n] - low) / root_size
+    for such a leaf the result is -1 - cell."""
+    i = wp.tid()
+    x = (points[order[i]] - low) / root_size
     u = wp.vec3(0.0, 0.0, 0.0)
     index = int(0)  # noqa: UP018  a variable for Warp, not a constant
     for axis in range(3):
         clamped = wp.clamp(x[axis], 0.0, float(shape[axis]))
-        i = wp.min(int(clamped), shape[axis] - 1)
-        u[axis] = clamped - float(i)
-        index = index * shape[axis] + i
+        whole = wp.min(int(clamped), shape[axis] - 1)
+        u[axis] = clamped - float(whole)
+        index = index * shape[axis] + whole
     down = child[index]
     while down >= 0:
         octant = int(0)  # noqa: UP018
         for axis in range(3):
             doubled = 2.0 * u[axis]
-            i = wp.min(int(doubled), 1)
-            u[axis] = doubled - float(i)
-            octant = 2 * octant + i
+            upper = wp.min(int(doubled), 1)
+            u[axis] = doubled - float(upper)
+            octant = 2 * octant + upper
         index = down + octant
         down = child[index]
-    local[n] = u
-    leaf[n] = -2 - down
-    if down == -1:
-        unknown[wp.atomic_add(unknown_count, 0, 1)] = index
+    local[i] = u
+    leaf[i] = wp.where(down == -1, -1 - index, -2 - down)
 
 
-# In C++, with the compiler's vector type: the same loops in Warp's Python took four times as long.
+# In C++, with the compiler's vector type: the same loops in Warp's Python took four times as long.  `following` is the
+# leaf of the next point: its rows are on their way while this point is posed.
 _POSED_POINT = """
     typedef float lanes __attribute__((vector_size(64), aligned(4)));
-    const int chunks = weight_chunks + offset_chunks;
-    const lanes* row[8];
+    typedef short codes __attribute__((vector_size(32), aligned(2)));
+    const int weight_chunks = weights.shape[1] / 16, offset_chunks = offsets.shape[1] / 16;
+    const float* weight_rows = weights.data;
+    const short* offset_rows = offsets.data;
+    const lanes* weight_row[8];
+    const codes* offset_row[8];
     float share[8];
     for (int k = 0; k < 8; ++k) {
-        row[k] = reinterpret_cast<const lanes*>(rows.data) + size_t(corners.data[8 * cell + k]) * chunks;
+        const size_t node = corners.data[8 * cell + k], next = corners.data[8 * following + k];
+        for (int chunk = 0; chunk < weight_chunks; ++chunk)
+            __builtin_prefetch(weight_rows + 16 * (next * weight_chunks + chunk));
+        for (int chunk = 0; chunk < offset_chunks; chunk += 2)
+            __builtin_prefetch(offset_rows + 16 * (next * offset_chunks + chunk));
+        weight_row[k] = reinterpret_cast<const lanes*>(weight_rows + 16 * node * weight_chunks);
+        offset_row[k] = reinterpret_cast<const codes*>(offset_rows + 16 * node * offset_chunks);
         share[k] = (k & 4 ? u[0] : 1 - u[0]) * (k & 2 ? u[1] : 1 - u[1]) * (k & 1 ? u[2] : 1 - u[2]);
     }
     const lanes* joint = reinterpret_cast<const lanes*>(transforms.data);
     lanes blended[4] = {};  // four sums, so that additions need not wait for each other
     for (int chunk = 0; chunk < weight_chunks; ++chunk, joint += 16) {
         lanes weight = {};
-        for (int k = 0; k < 8; ++k) weight += share[k] * row[k][chunk];
+        for (int k = 0; k < 8; ++k) weight += share[k] * weight_row[k][chunk];
         for (int lane = 0; lane < 16; ++lane) blended[lane % 4] += weight[lane] * joint[lane];
     }
     const lanes affine = (blended[0] + blended[1]) + (blended[2] + blended[3]);
@@ -99,7 +108,7 @@ _POSED_POINT = """
     lanes offset = {};
     for (int chunk = 0; chunk < offset_chunks; ++chunk) {
         lanes part = {};
-        for (int k = 0; k < 8; ++k) part += share[k] * row[k][weight_chunks + chunk];
+        for (int k = 0; k < 8; ++k) part += share[k] * __builtin_convertvector(offset_row[k][chunk], lanes);
         offset += part * factor[chunk];
     }
     float moved[3];
@@ -118,10 +127,10 @@ def posed_point(
     X: wp.vec3,
     u: wp.vec3,
     cell: int,
+    following: int,
     corners: wp.array2d(dtype=wp.int32),
-    rows: wp.array2d(dtype=wp.float32),
-    weight_chunks: int,
-    offset_chunks: int,
+    weights: wp.array2d(dtype=wp.float32),
+    offsets: wp.array2d(dtype=wp.int16),
     transforms: wp.array2d(dtype=wp.float32),
     factors: wp.array(dtype=wp.float32),
 ) -> wp.vec3: ...
@@ -129,22 +138,31 @@ def posed_point(
 
 @wp.kernel
 def pose_points(
+    order: wp.array(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     local: wp.array(dtype=wp.vec3),
     leaf: wp.array(dtype=wp.int32),
     corners: wp.array2d(dtype=wp.int32),
-    rows: wp.array2d(dtype=wp.float32),
-    weight_chunks: int,
-    offset_chunks: int,
+    weights: wp.array2d(dtype=wp.float32),
+    offsets: wp.array2d(dtype=wp.int16),
     transforms: wp.array2d(dtype=wp.float32),
     factors: wp.array(dtype=wp.float32),
     posed: wp.array(dtype=wp.vec3),
 ):
     """M_G = (sum_j W~_j T_j) (X + B~s + B~p)      (Eq. 7-8), fields interpolated between the corners of the leaf.
 
-    A node's row: weights in `weight_chunks` chunks, then displacements in `offset_chunks` chunks of TRIPLES; `factors`
-    has the factor of each displacement three times, and 0 for what is to spare."""
-    n = wp.tid()
+    A node's row: weights in whole chunks of LANES, and displacements as integers in chunks of TRIPLES; `factors` has
+    what each displacement's integers are multiplied with, three times, and 0 for what is to spare."""
+    i = wp.tid()
+    n = order[i]
     posed[n] = posed_point(
-        points[n], local[n], leaf[n], corners, rows, weight_chunks, offset_chunks, transforms, factors
+        points[n],
+        local[i],
+        leaf[i],
+        leaf[wp.min(i + 1, order.shape[0] - 1)],
+        corners,
+        weights,
+        offsets,
+        transforms,
+        factors,
     )
