@@ -8,6 +8,7 @@ import base64
 import html
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,9 +116,10 @@ class Panel:
         """What is seen now, drawn without a browser.  Raises CannotDraw on a machine without GL."""
         width, height = size or self.size
         if self.plot is None:
-            return picture(self.scene, (width, height), self.frame, oversampling)
+            return picture(fitted(self.scene, self.size, (width, height)), (width, height), self.frame, oversampling)
         aside = round(width * PLOT_SHARE)
-        left = picture(self.scene, (width - aside, height), self.frame, oversampling)
+        room = (width - aside, height)
+        left = picture(fitted(self.scene, self.size, room), room, self.frame, oversampling)
         return np.concatenate([left, self.plot((aside, height), self.frame)], axis=1)
 
     def page(self, path: str | Path) -> Path:
@@ -233,6 +235,17 @@ class _Held:
 def size_for(views: int) -> tuple[int, int]:
     """Pixels for some views side by side: a body is higher than wide."""
     return (SIZE[0] if views <= 2 else ROOM, SIZE[1] if views <= 2 else HEIGHT)
+
+
+def fitted(scene: Scene, made_for: tuple[int, int], size: tuple[int, int]) -> Scene:
+    """The scene with its own camera moved back where a picture is narrower than the one it was made for."""
+    narrower = (made_for[0] / made_for[1]) / (size[0] / size[1])
+    camera = scene.camera
+    if camera is None or narrower <= 1:
+        return scene
+    position, target = np.array(camera.position), np.array(camera.target)
+    back = target + narrower * (position - target)
+    return replace(scene, camera=replace(camera, position=(float(back[0]), float(back[1]), float(back[2]))))
 
 
 def _line(text: str) -> str:

@@ -40,6 +40,7 @@ def sdf_view(
         raise ValueError(f"{len(names)} names for {len(shown)} distances")
     across = across or min(POINTS.get(type(one), COARSEST) for one in shown)
     cut = SliceControls.around(body.template)
+    lattice = max(LATTICE.get(type(one), COARSE_LATTICE) for one in shown)  # one for all, to compare them
     look = Choice("look", (CUT, ERROR, LEVEL))
     level = Number("level (mm)", 0.0, -30.0, 100.0, 5.0, "0: the body's surface; above: that far outside")
     ghost = Mesh(body.template.numpy(), body.faces.numpy(), SKIN, GHOST, name="body")
@@ -54,7 +55,7 @@ def sdf_view(
         for index, (one, name) in enumerate(zip(shown, names, strict=True)):
             if look.value == LEVEL:
                 if index not in blocks:
-                    blocks[index] = Block.of(one, low, high, LATTICE.get(type(one), COARSE_LATTICE))
+                    blocks[index] = Block.of(one, low, high, lattice)
                 vertices, faces = blocks[index].level_set(level.value / MILLI)
                 shell = Mesh(vertices, faces, (0.55, 0.68, 0.62), name="level set")
                 layers = (ghost, shell) if level.value else (shell,)  # at 0 the one would hide the other
@@ -76,10 +77,9 @@ def sdf_view(
         for one, name in zip(shown, names, strict=True):
             values = one(points)
             wrong, sign = MILLI * (values - truth).abs(), ((values < 0) != (truth < 0)).float().mean()
-            parts.append(
-                f"{name}: error {float(wrong.mean()):.2f} mm on the cut, sign wrong at {100 * float(sign):.2f} %"
-            )
-        return f"cut at {'xyz'[cut.axis]} = {cut.position:.2f} m; " + "; ".join(parts)
+            parts.append(f"{name}: {float(wrong.mean()):.2f} mm, {100 * float(sign):.2f} %")
+        where = f"cut at {'xyz'[cut.axis]} = {cut.position:.2f} m; mean error on it and share of wrong signs"
+        return f"{where}: {'; '.join(parts)}"
 
     return Panel(
         (Group("What is seen", (look, level)), cut.group),

@@ -9,13 +9,18 @@ from typing import Any
 
 from widgets.body_view import body_view
 from widgets.fields_view import fields_view
+from widgets.garment_model_view import garment_model_view
 from widgets.panel import Panel
+from widgets.projection_view import ProjectionComparison, comparison_view, projector_view, sequence_view
 from widgets.sdf_view import sdf_view
 from widgets.subspace_view import subspace_view
 from widgets.tryon_view import demo_view, result_view, tryon_view
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.diffused_body import DiffusedFields
+from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.projection import Projector
+from workbench.collisions.sequences import SimulatedSequence
 from workbench.collisions.subspace import Subspace
 from workbench.collisions.tryon import TryOn, TryOnResult
 from workbench.tryon_demo import TryOnDemo
@@ -34,6 +39,10 @@ def view(result: Any, *others: Any, **options: Any) -> Panel:
 view.register(Body, body_view)
 view.register(DiffusedFields, fields_view)
 view.register(BodySDF, sdf_view)
+view.register(SimulatedSequence, sequence_view)
+view.register(GarmentModel, garment_model_view)
+view.register(Projector, projector_view)
+view.register(ProjectionComparison, comparison_view)
 view.register(Subspace, subspace_view)
 view.register(TryOn, tryon_view)
 view.register(TryOnResult, result_view)

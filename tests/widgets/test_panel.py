@@ -4,6 +4,7 @@ import base64
 import io
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import widgets.live
 from widgets import gl, panel
 from widgets.controls import Button, Group, Number
 from widgets.frontend_bundle import NotBundled
-from widgets.panel import Panel
+from widgets.panel import Panel, fitted
 from widgets.scene import Points, Scene, View
 from workbench.extras import MissingExtra
 
@@ -149,6 +150,17 @@ def test_without_widgets_there_is_a_picture(monkeypatch, lacking):
     if lacking != "ipywidgets":
         with pytest.raises(kind):
             _ = made.live
+
+
+@pytest.mark.parametrize("size", [(160, 120), (320, 120), (80, 120), (60, 120)])
+def test_a_narrower_picture_is_taken_from_farther_away(size):
+    made, _ = panel_of()
+    scene = replace(made.scene, camera=made.scene.resolved_camera(160 / 120))
+    seen = fitted(scene, (160, 120), size)
+    assert scene.camera is not None and seen.camera is not None
+    distances = [np.linalg.norm(np.subtract(c.position, c.target)) for c in (scene.camera, seen.camera)]
+    assert distances[1] / distances[0] == pytest.approx(max(1.0, 160 / size[0]))
+    assert seen.camera.target == scene.camera.target
 
 
 def test_where_nothing_can_draw_a_line_says_so(monkeypatch):
