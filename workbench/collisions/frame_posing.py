@@ -6,7 +6,6 @@ one kernel finds a point's cell, reads its eight rows, blends, corrects and skin
 """
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.posing_kernels import LANES, TRIPLES, find_leaves, joint_transforms, pose_points
 from workbench.geometry.closest_point import morton_order
-from workbench.geometry.field_grid import shared_array
+from workbench.geometry.warp_launch import Recorded, shared_array
 
 ROWS_INPUT = 4  # of `pose_points`: corners, then weights, then offsets
 CODES = 32767  # the largest integer of 16 bits
@@ -189,24 +188,6 @@ class TablePoser(FramePoser):
             shared_array(nodes.weights, wp.float32, 2),
             shared_array(nodes.offsets, wp.int16, 2),
         )
-
-
-class Recorded:
-    """A launch that is repeated: a fifth of the cost of a new one.  Keeps its arrays alive."""
-
-    def __init__(self, kernel: Any, dim: int, *inputs: Any):
-        self.inputs = list(inputs)
-        self.command: Any = wp.launch(
-            kernel, dim=dim, inputs=self.inputs, device="cpu", record_tape=False, record_cmd=True
-        )
-
-    def __call__(self) -> None:
-        self.command.launch()
-
-    def replace(self, index: int, array: wp.array) -> None:
-        """Another array for one input."""
-        self.inputs[index] = array
-        self.command.set_param_at_index(index, array)
 
 
 def frame_poser(model: GarmentModel, betas: Float[Tensor, "K"], points: int) -> FramePoser:

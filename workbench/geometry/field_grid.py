@@ -24,6 +24,7 @@ from workbench.store import atomic_write
 
 from .closest_point import run_chunks
 from .warp_kernels import locate_in_octree
+from .warp_launch import shared_array
 
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
 LATTICE = np.stack(np.meshgrid([0, 1, 2], [0, 1, 2], [0, 1, 2], indexing="ij"), -1).reshape(27, 3)  # of a split cell
@@ -213,11 +214,6 @@ class _Lookup(torch.autograd.Function):
         )
         outside = (points < grid.low.to(points)) | (points > grid.high.to(points))
         return gradient.masked_fill(outside, 0.0), None
-
-
-def shared_array(array: np.ndarray, dtype: Any, ndim: int = 1) -> wp.array:
-    """Warp's view of the same memory."""
-    return wp.array(array, dtype=dtype, ndim=ndim, device="cpu", copy=False)
 
 
 def _table(grid: FieldGrid, points: Tensor) -> Tensor:

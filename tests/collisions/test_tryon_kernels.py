@@ -1,0 +1,66 @@
+"""The networks in kernels: what torch gives, for networks as files hold them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from workbench.collisions.regressor import Regressor
+from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
+from workbench.collisions.tryon import TorchNetworks, TryOn
+from workbench.collisions.tryon_kernels import KernelNetworks
+from workbench.formats import load_motion, motion_files
+
+
+@pytest.fixture(scope="module")
+def tryon() -> TryOn:
+    return TryOn.shipped("tshirt")
+
+
+def test_each_network_gives_what_torch_gives(tryon):
+    one, two = TorchNetworks(tryon.regressor, tryon.subspace), KernelNetworks(tryon.regressor, tryon.subspace)
+    chance = torch.Generator().manual_seed(0)
+    ours = theirs = torch.zeros(2, 1, 500)
+    with torch.no_grad():
+        for _ in range(20):
+            inputs = torch.randn(52, generator=chance)
+            wanted, theirs = one.regress(inputs, theirs)
+            found, ours = two.regress(inputs, ours)
+            torch.testing.assert_close(found, wanted, atol=2e-5, rtol=1e-4)
+            torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
+            latent = torch.randn(25, generator=chance)
+            torch.testing.assert_close(two.decode(latent), one.decode(latent), atol=1e-5, rtol=0)  # metres
+
+
+def test_a_stream_on_kernels_is_within_ten_micrometres_of_one_in_torch(tryon):
+    motion = load_motion(motion_files(None)[0], tryon.model.body).clip(0, 30)
+    betas = torch.linspace(-1, 1, 10)
+    slow, fast = tryon.stream(betas), replace(tryon, networks=KernelNetworks(tryon.regressor, tryon.subspace))
+    fast = fast.stream(betas)
+    for r, h in zip(motion.rotations, motion.translation, strict=True):
+        apart = fast(r, h).garment - slow(r, h).garment
+        assert float(apart.norm(dim=-1).max()) < 1e-5
+
+
+def test_a_result_outlives_the_next_frame(tryon):
+    networks = KernelNetworks(tryon.regressor, tryon.subspace)
+    latent, hidden = networks.regress(torch.ones(52), torch.zeros(2, 1, 500))
+    X = networks.decode(torch.ones(25))
+    kept = [latent.clone(), hidden.clone(), X.clone()]
+    networks.regress(-torch.ones(52), torch.ones(2, 1, 500))
+    networks.decode(-torch.ones(25))
+    for now, before in zip((latent, hidden, X), kept, strict=True):
+        assert torch.equal(now, before)
+
+
+def test_networks_that_float16_cannot_hold_are_refused(tryon):
+    fresh = Regressor("tshirt", 31, 10, 30.0, torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"weight_ih_l0 is not exact in float16.*save and load"):
+        KernelNetworks(fresh, tryon.subspace)
+
+
+def test_a_dense_decoder_is_refused(tryon):
+    config = NetworkConfig(width=8, depth=1, rank=0)
+    dense = Subspace("tshirt", Statistics.blank(tryon.subspace.vertex_count, config), config)
+    with pytest.raises(ValueError, match="no dense last layer"):
+        KernelNetworks(tryon.regressor, dense)
