@@ -53,7 +53,9 @@ class Panel:
         plot: Plot | None = None,
         title: str = "Garment workbench",
         size: tuple[int, int] = SIZE,
+        write: Callable[[Path], Path] | None = None,
     ):
+        self._write = write
         self.groups, self.title, self.size, self.plot = tuple(groups), title, size, plot
         self.controls: dict[str, Any] = dict(controls_of(groups))
         self._compute, self._read = scene, readout
@@ -123,7 +125,9 @@ class Panel:
         return np.concatenate([left, self.plot((aside, height), self.frame)], axis=1)
 
     def page(self, path: str | Path) -> Path:
-        """The scene as one HTML file, which works offline (without the controls).  Raises NotBundled."""
+        """The scene as one HTML file, which works offline, without the controls.  Raises NotBundled."""
+        if self._write is not None:
+            return self._write(Path(path))
         return write_page(path, self.scene, f"{self.title}: {self.readout}" if self.readout else self.title)
 
     @cached_property

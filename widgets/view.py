@@ -8,10 +8,15 @@ import functools
 from typing import Any
 
 from widgets.body_view import body_view
+from widgets.descriptor_view import DescribedMotion, described_view, motion_view
+from widgets.evaluation_view import list_view
 from widgets.fields_view import fields_view
 from widgets.garment_model_view import garment_model_view
+from widgets.inspection_panel import inspection_result_view, inspection_view
 from widgets.panel import Panel
+from widgets.plot import FigurePanel
 from widgets.projection_view import ProjectionComparison, comparison_view, projector_view, sequence_view
+from widgets.regressor_view import regressor_view
 from widgets.sdf_view import sdf_view
 from widgets.subspace_view import subspace_view
 from widgets.tryon_view import demo_view, result_view, tryon_view
@@ -19,15 +24,19 @@ from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.diffused_body import DiffusedFields
 from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.inspection import Inspection
 from workbench.collisions.projection import Projector
+from workbench.collisions.regressor import Regressor
 from workbench.collisions.sequences import SimulatedSequence
 from workbench.collisions.subspace import Subspace
 from workbench.collisions.tryon import TryOn, TryOnResult
+from workbench.inspector import InspectionResult
+from workbench.motion import Motion
 from workbench.tryon_demo import TryOnDemo
 
 
 @functools.singledispatch
-def view(result: Any, *others: Any, **options: Any) -> Panel:
+def view(result: Any, *others: Any, **options: Any) -> Panel | FigurePanel:
     """A panel: `.scene`, `.live`, `.picture(size)`, `.page(path)`, `panel["latent"] = ...`.
 
     Errors: TypeError for what no stage makes.
@@ -47,3 +56,9 @@ view.register(Subspace, subspace_view)
 view.register(TryOn, tryon_view)
 view.register(TryOnResult, result_view)
 view.register(TryOnDemo, demo_view)
+view.register(Motion, motion_view)
+view.register(DescribedMotion, described_view)
+view.register(Regressor, regressor_view)
+view.register(list, list_view)
+view.register(Inspection, inspection_view)
+view.register(InspectionResult, inspection_result_view)
