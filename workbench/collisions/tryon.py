@@ -148,19 +148,21 @@ class TryOn:
         betas = checked_shape(betas, self.model.body)
         motion = self._at_rate(motion)
         latent = self.latents(motion, betas)
-        canonical, garment, bodies = [], [], []
-        for part in torch.arange(len(motion)).split(POSED_AT_ONCE):
+        frames, vertices, body = len(motion), self.subspace.vertex_count, self.model.body
+        canonical, garment = latent.new_empty(frames, vertices, 3), latent.new_empty(frames, vertices, 3)
+        bodies = latent.new_empty(frames, len(body.template), 3)
+        for part in (slice(at, at + POSED_AT_ONCE) for at in range(0, frames, POSED_AT_ONCE)):
             rotations, translation = motion.rotations[part], motion.translation[part]
-            X = self.subspace.decode(latent[part])
-            canonical.append(X)
-            garment.append(self.model.posed(X, self.model.state(rotations, betas, translation)))
-            bodies.append(self.model.body.vertices(rotations, betas, translation))
-            progress(len(part))
+            canonical[part] = self.subspace.decode(latent[part])
+            state = self.model.state(rotations, betas, translation)
+            garment[part] = self.model.posed(canonical[part], state)
+            bodies[part] = body.vertices(rotations, betas, translation)
+            progress(len(rotations))
         return TryOnResult(
             latent=latent,
-            canonical=torch.cat(canonical),
-            garment=torch.cat(garment),
-            body=torch.cat(bodies),
+            canonical=canonical,
+            garment=garment,
+            body=bodies,
             garment_faces=self.garment.faces,
             body_faces=self.model.body.faces,
             betas=betas,
