@@ -20,7 +20,9 @@ MAKERS = {
     "simulations": ("assets_gen.simulations", "SimulationsConfig"),
     "scans": ("assets_gen.scans", "ScansConfig"),
     "dataset": ("assets_gen.dataset", "DatasetConfig"),
+    "outfits": ("assets_gen.outfit_dataset", "OutfitsConfig"),
     "models": ("assets_gen.models", "ModelsConfig"),
+    "points": ("assets_gen.point_models", "PointModelsConfig"),
 }
 
 

@@ -12,6 +12,7 @@ SMALL = PointModelConfig(
     encoder=PoseEncoderConfig(depth=4, width=4, features=6),
     geometry=GeometryFeaturesConfig(size=16, features=5),
     decoder=ShapeDecoderConfig(width=24, features=11),
+    input_size=32,
 )
 
 

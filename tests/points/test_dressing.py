@@ -22,10 +22,10 @@ def test_it_agrees_with_the_plain_model(body, small_model, trained_like):
     with torch.no_grad():
         features = model.geometry(torch.tensor([1]))
         plain = model(image, torch.tensor([1, 1]), posed_queries(atlas_of(body, 48).queries, bodies))
-    exact = Dresser(model, features, body, input_size=32, query_size=48, precision="float32")(bodies)
+    exact = Dresser(model, features, body, query_size=48, precision="float32")(bodies)
     torch.testing.assert_close(exact.points, plain.points, atol=1e-6, rtol=0)
     torch.testing.assert_close(exact.normals, plain.normals, atol=1e-4, rtol=0)
-    half = Dresser(model, features, body, input_size=32, query_size=48, precision="bfloat16")(bodies)
+    half = Dresser(model, features, body, query_size=48, precision="bfloat16")(bodies)
     moved = plain.displacement.norm(dim=-1).max()
     assert (half.points - plain.points).norm(dim=-1).max() < 0.05 * moved
 
@@ -38,7 +38,7 @@ def test_animation_stands_in_the_world(body, small_model, trained_like):
     motion, betas = motion_of(body), torch.full((body.shape_count,), 0.3)
     atlas = atlas_of(body, 32)
     with torch.no_grad():
-        dresser = Dresser(model, model.geometry(torch.tensor([0])), body, queries=atlas.queries, input_size=32)
+        dresser = Dresser(model, model.geometry(torch.tensor([0])), body, queries=atlas.queries)
     surface = body.vertices(motion.rotations, betas, motion.translation)
     for frame, vertices in zip(dresser.animate(motion, betas), surface, strict=True):
         torch.testing.assert_close(frame.points, atlas.queries.interpolate(vertices), atol=1e-5, rtol=0)

@@ -60,7 +60,7 @@ def test_both_ways_give_the_same_points(body, small_model, trained_like):
     model = trained_like(small_model)
     bodies = posed_bodies(body, body.rest_rotations()[None], body.mean_shape())
     queries = atlas_of(body, 48).queries
-    image = atlas_of(body, 128).map_of(bodies.neutral)
+    image = atlas_of(body, 32).map_of(bodies.neutral)
     with torch.no_grad():
         geometry = model.geometry(torch.tensor([0]))
     plain = dress_every_pixel(model, geometry, image, queries, bodies, 48)

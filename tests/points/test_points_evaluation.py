@@ -18,7 +18,7 @@ from workbench.points.scan_fitting import ScanFitConfig
 from workbench.points.scans import ScanFrame, ScanSequence
 from workbench.points.shape_decoder import ShapeDecoderConfig
 from workbench.points.trained_points import TrainedPatches, TrainedPoints
-from workbench.points.training import PointTrainingConfig, ScanSet
+from workbench.points.training import PointTrainingConfig
 from workbench.points.uv_position_map import posed_bodies
 
 CONFIG = PointsEvaluation(
@@ -84,6 +84,6 @@ def test_what_was_not_trained_is_left_out(folder, body):
 
 
 def test_a_step_is_timed(folder, body, small_model):
-    scans = ScanSet.of(body, [ScanSequence.load(folder / "test" / "tshirt.npz")], input_size=16)
-    few = PointTrainingConfig(batch=1, queries=100, scan_points=200, input_size=16, query_size=32)
-    assert 0 < step_seconds(small_model, scans, few) < 10
+    scans = [ScanSequence.load(folder / "test" / "tshirt.npz")]
+    few = PointTrainingConfig(batch=1, queries=100, scan_points=200, query_size=32)
+    assert 0 < step_seconds(small_model, scans, body, few, 1) < 10

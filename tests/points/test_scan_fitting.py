@@ -14,7 +14,6 @@ CONFIG = ScanFitConfig(
     fit=FitConfig(steps=40, learning_rate=0.05, last_rate=0.01, warmup=2, clip_norm=1e9, checkpoint_every=10**9),
     queries=400,
     scan_points=1500,
-    input_size=32,
     query_size=48,
 )
 

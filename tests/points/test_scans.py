@@ -62,3 +62,17 @@ def test_foreign_files_are_refused(tmp_path, sequence):
     np.savez(tmp_path / "y.npz", **{**np.load(tmp_path / "s.npz"), "format": np.array("scan-sequence-9")})
     with pytest.raises(ValueError, match="format 'scan-sequence-9'; expected 'scan-sequence-1'"):
         ScanSequence.load(tmp_path / "y.npz")
+
+
+def test_a_part_of_a_sequence_is_that_part(sequence):
+    packed, _ = sequence
+    part = packed.first(3).thinned(20)
+    assert len(part) == 3 and len(part.rotations) == 3
+    for t in range(3):
+        torch.testing.assert_close(part.frame(t).points, packed.frame(t).points[:20])
+        torch.testing.assert_close(part.frame(t).normals, packed.frame(t).normals[:20])
+    assert len(packed.first(9)) == 4
+    with pytest.raises(ValueError, match="0 frames are asked for; expected 1 or more"):
+        packed.first(0)
+    with pytest.raises(ValueError, match="51 points are asked for of scans of 50; expected 1 to 50"):
+        packed.thinned(51)

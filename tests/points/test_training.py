@@ -48,7 +48,6 @@ def config_of(**changes):
             "batch": 2,
             "queries": 400,
             "scan_points": 1500,
-            "input_size": 32,
             "query_size": 64,
             "calibration": 2,
             "precision": "float32",

@@ -8,13 +8,14 @@ import torch
 from workbench.learning.fit import FitConfig
 from workbench.learning.scalar_log import read_curves
 from workbench.points import training_run
+from workbench.points.clothed_points import PointModel, PointModelConfig
 from workbench.points.patches import PatchModelConfig
 from workbench.points.pose_encoder import PoseEncoderConfig
 from workbench.points.scans import ScanFrame, ScanSequence, load_scans
 from workbench.points.shape_decoder import ShapeDecoderConfig
 from workbench.points.trained_points import TrainedPatches, TrainedPoints
 from workbench.points.training import PointTrainingConfig
-from workbench.points.training_run import TrainPointsConfig, chosen, run, training_folder
+from workbench.points.training_run import TrainPointsConfig, begin_with, chosen, run, training_folder
 from workbench.points.uv_position_map import posed_bodies
 
 TRAINING = PointTrainingConfig(
@@ -24,7 +25,6 @@ TRAINING = PointTrainingConfig(
     scan_points=500,
     calibration=1,
     precision="float32",
-    input_size=16,
     query_size=32,
 )
 
@@ -87,6 +87,21 @@ def test_one_model_of_all_outfits(data, small, tmp_path, body):
     assert len(path.read_bytes()) == pytest.approx(len(once), abs=64)
     with pytest.raises(ValueError, match="belongs to another run"):
         run(replace(config, training=replace(TRAINING, fit=replace(TRAINING.fit, steps=6))))
+
+
+def test_a_model_to_begin_with(data, small, tmp_path, body):
+    """Of one outfit: its G is kept, the new outfit begins at the mean; other sizes are refused."""
+    (first,) = run(TrainPointsConfig(data=data, out=tmp_path / "a", outfits="tshirt", training=TRAINING))
+    trained = TrainedPoints.load(first, body)
+    model = PointModel(2, trained.model.config, generator=torch.Generator().manual_seed(9))
+    begin_with(trained, model, ("dress", "tshirt"))
+    assert torch.equal(model.geometry.stored[0], trained.model.geometry.stored[0])
+    assert torch.equal(model.geometry.stored[1], trained.model.geometry.stored[0])
+    assert torch.equal(model.decoder.to_normal.weight, trained.model.decoder.to_normal.weight)
+    (second,) = run(TrainPointsConfig(data=data, out=tmp_path / "b", start=first, training=TRAINING))
+    assert TrainedPoints.load(second, body).story["start"]["motions"] == ["walk"]
+    with pytest.raises(ValueError, match="the model to begin with has sizes"):
+        begin_with(trained, PointModel(1, PointModelConfig(), generator=torch.Generator()), ("tshirt",))
 
 
 def test_one_model_an_outfit(data, small, tmp_path, body):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from workbench.points.geometry_features import GeometryFeatures, GeometryFeaturesConfig
 from workbench.points.pose_encoder import PoseEncoder, PoseEncoderConfig
 from workbench.points.shape_decoder import CanonicalClothes, ShapeDecoder, ShapeDecoderConfig, decoder_inputs
-from workbench.points.uv_position_map import PosedQueries
+from workbench.points.uv_position_map import INPUT_SIZE, PosedQueries
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class PointModelConfig:
     encoder: PoseEncoderConfig = PoseEncoderConfig()
     geometry: GeometryFeaturesConfig = GeometryFeaturesConfig()
     decoder: ShapeDecoderConfig = ShapeDecoderConfig()
+    input_size: int = INPUT_SIZE  # pixels a side of the position map that the encoder reads
 
     def __post_init__(self) -> None:
         total = self.encoder.features + self.geometry.features

@@ -14,7 +14,6 @@ from workbench.points.scans import ScanFrame
 from workbench.points.shape_decoder import CanonicalClothes, read_features
 from workbench.points.training import Precision, autocast
 from workbench.points.uv_position_map import (
-    INPUT_SIZE,
     QUERY_SIZE,
     PosedBodies,
     SurfaceQueries,
@@ -37,7 +36,6 @@ class Dresser:
         body: Body,
         *,
         queries: SurfaceQueries | None = None,
-        input_size: int = INPUT_SIZE,
         query_size: int = QUERY_SIZE,
         precision: Precision = "float32",
     ):
@@ -47,7 +45,7 @@ class Dresser:
         self.model, self.body = model.eval(), body
         self.precision: Precision = precision
         self.queries = atlas_of(body, query_size).queries if queries is None else queries
-        self._atlas = atlas_of(body, input_size)
+        self._atlas = atlas_of(body, model.config.input_size)
         self._decoder = FastDecoder(model.decoder, model.config.encoder.features, DTYPES[precision])
         with torch.no_grad():
             self._share = self._decoder.share(self.queries.u, read_features(geometry, self.queries.u)[0])

@@ -22,7 +22,6 @@ from workbench.points.scans import ScanFrame
 from workbench.points.shape_decoder import CanonicalClothes
 from workbench.points.training import Batch, ScanSet
 from workbench.points.uv_position_map import (
-    INPUT_SIZE,
     QUERY_SIZE,
     PosedBodies,
     SurfaceQueries,
@@ -130,7 +129,7 @@ def forward_times(
     model.eval()
     with torch.no_grad():
         geometry = model.geometry(torch.tensor([0]))
-    image = atlas_of(body, INPUT_SIZE).map_of(bodies.neutral)
+    image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
     queries = atlas_of(body, query_size).queries
     dresser = Dresser(model, geometry, body, queries=queries)
     plain = dress_every_pixel(model, geometry, image, queries, bodies, query_size)

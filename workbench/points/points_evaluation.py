@@ -257,11 +257,9 @@ def speed_rows(
     if not config.paper_step:
         log.info("left out: a step of the paper's training (--paper-step)")
         return found
-    own = PointTrainingConfig()
-    ours = step_seconds(PointModel(_count(scans), trained.model.config, generator=generator), frames, own, repeats=3)
-    theirs = step_seconds(
-        PointModel(_count(scans), PointModelConfig(), generator=generator), frames, papers_training(len(frames))
-    )
+    own, papers = PointTrainingConfig(batch=4), papers_training(len(frames))
+    ours = step_seconds(PointModel(_count(scans), trained.model.config, generator=generator), scans, body, own, 3)
+    theirs = step_seconds(PointModel(_count(scans), PointModelConfig(), generator=generator), scans, body, papers, 1)
     return [
         *found,
         told("training step of 4 frames, paper-sized, all pixels, float32", theirs, "CPU-s"),
@@ -270,16 +268,19 @@ def speed_rows(
     ]
 
 
-def step_seconds(model: PointModel, scans: ScanSet, config: PointTrainingConfig, repeats: int = 1) -> float:
+def step_seconds(
+    model: PointModel, scans: Sequence[ScanSequence], body: Body, config: PointTrainingConfig, repeats: int
+) -> float:
     """CPU seconds of a step of training, forward, backward and Adam."""
-    places = atlas_of(scans.body, config.query_size).queries
+    frames = ScanSet.of(body, scans, model.config.input_size)
+    places = atlas_of(body, config.query_size).queries
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     generator = torch.Generator().manual_seed(config.seed)
     model.train()
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        step_loss(model, scans, places, config, config.fit.steps, generator).backward()
+        step_loss(model, frames, places, config, config.fit.steps, generator).backward()
         optimizer.step()
 
     return least_cpu_seconds(step, repeats)

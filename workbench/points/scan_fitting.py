@@ -30,7 +30,6 @@ from workbench.points.losses import (
 from workbench.points.scans import ScanFrame
 from workbench.points.training import Precision, autocast, thin
 from workbench.points.uv_position_map import (
-    INPUT_SIZE,
     QUERY_SIZE,
     PosedBodies,
     SurfaceQueries,
@@ -54,7 +53,6 @@ class ScanFitConfig:
     queries: int = 6000  # pixels a step
     scan_points: int = 12000  # of the scan a step
     precision: Precision = "float32"
-    input_size: int = INPUT_SIZE
     query_size: int = QUERY_SIZE
     seed: int = 0
 
@@ -118,7 +116,7 @@ def fit_scan(
     """
     require_aligned(scan, bodies)
     places = atlas_of(body, config.query_size).queries
-    image = atlas_of(body, config.input_size).map_of(bodies.neutral)
+    image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
     model.eval().requires_grad_(False)
     try:
         with torch.no_grad(), autocast(config.precision):

@@ -5,7 +5,7 @@ in 127ths: 9 bytes a point.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +78,24 @@ class ScanSequence:
             self.betas,
             self.fps / stride,
         )
+
+    def first(self, frames: int) -> "ScanSequence":
+        """The first so many frames, or all there are."""
+        if frames < 1:
+            raise ValueError(f"{frames} frames are asked for; expected 1 or more")
+        return replace(
+            self,
+            ticks=self.ticks[:frames],
+            normal_ticks=self.normal_ticks[:frames],
+            rotations=self.rotations[:frames],
+        )
+
+    def thinned(self, points: int) -> "ScanSequence":
+        """The first so many points of each scan, a random part of it, as scans come in no order."""
+        there = self.ticks.shape[1]
+        if not 1 <= points <= there:
+            raise ValueError(f"{points} points are asked for of scans of {there}; expected 1 to {there}")
+        return replace(self, ticks=self.ticks[:, :points], normal_ticks=self.normal_ticks[:, :points])
 
     @staticmethod
     def of(

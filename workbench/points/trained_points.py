@@ -42,6 +42,7 @@ class TrainedPoints:
             encoder=PoseEncoderConfig(**stored.config["encoder"]),
             geometry=GeometryFeaturesConfig(**stored.config["geometry"]),
             decoder=ShapeDecoderConfig(**stored.config["decoder"]),
+            input_size=stored.config["input_size"],
         )
         model = PointModel(len(stored.outfits), config, generator=torch.Generator())
         model.load_state_dict(stored.tensors)

@@ -30,9 +30,10 @@ log = logging.getLogger(__name__)
 
 # Ours: half the paper's widths, so that a training fits two cores
 TWO_CORES = PointModelConfig(
-    encoder=PoseEncoderConfig(width=16, features=32),
+    encoder=PoseEncoderConfig(depth=6, width=16, features=32),
     geometry=GeometryFeaturesConfig(size=64, features=32),
     decoder=ShapeDecoderConfig(width=128, features=64),
+    input_size=64,
 )
 TWO_CORES_PATCHES = PatchModelConfig(
     encoder=PoseEncoderConfig(depth=5, width=16, features=32), decoder=ShapeDecoderConfig(width=128, features=34)
@@ -58,6 +59,8 @@ class TrainPointsConfig:
     outfits: str = ""
     # All outfits but these, with commas.
     hold_out: str = ""
+    # Begin with the networks of this model (POP): outfits that it knows keep their G, others begin at the mean.
+    start: Path | None = None
     # Learn from every n-th frame: 2, 4 and 8 are the halves, quarters and eighths of Tab. 2.
     every: int = 1
     training: PointTrainingConfig = PointTrainingConfig()
@@ -107,7 +110,8 @@ def chosen(scans: Sequence[ScanSequence], config: TrainPointsConfig) -> list[Sca
 def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Body, name: str) -> Path:
     """One model, with its curves beside the checkpoint in `out`/work/NAME and in the model file."""
     patches = config.method == "patches"
-    size = TWO_CORES_PATCHES.size if patches else config.training.input_size
+    sizes = PointModelConfig() if config.paper else TWO_CORES
+    size = TWO_CORES_PATCHES.size if patches else sizes.input_size
     frames = ScanSet.of(body, scans, size)
     training = papers_training(len(frames)) if config.paper else config.training
     generator = torch.Generator().manual_seed(training.seed)
@@ -116,8 +120,9 @@ def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Bo
         places = atlas_of(body, size).queries
         training = replace(training, queries=max(1, training.queries // model.config.side**2))
     else:
-        sizes = PointModelConfig() if config.paper else TWO_CORES
         model = PointModel(len(frames.outfits), sizes, generator=generator)
+        if config.start is not None:
+            begin_with(TrainedPoints.load(config.start, body), model, frames.outfits)
         places = None
     work = config.out / "work" / name
     log.info("%s: %d scans of %s", name, len(frames), ", ".join(frames.outfits))
@@ -134,6 +139,7 @@ def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Bo
     story = {
         "training": _plain(training),
         "every": config.every,
+        "start": None if config.start is None else TrainedPoints.load(config.start, body).story,
         "frames": len(frames),
         "motions": sorted({scan.motion for scan in scans}),
         "curves": read_curves(work / "curves.jsonl"),
@@ -145,6 +151,19 @@ def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Bo
         TrainedPoints(model, frames.outfits, story).save(path, body)
     log.info("written: %s (%.1f MB)", path, path.stat().st_size / 1e6)
     return path
+
+
+@torch.no_grad()
+def begin_with(trained: TrainedPoints, model: PointModel, outfits: Sequence[str]) -> None:
+    """Copy the networks of a trained model, and its G where it knows the outfit.  ValueError for other sizes."""
+    if trained.model.config != model.config:
+        raise ValueError(f"the model to begin with has sizes {trained.model.config}, expected {model.config}")
+    networks = {key: value for key, value in trained.model.state_dict().items() if key != "geometry.stored"}
+    model.load_state_dict(networks, strict=False)
+    known = trained.model.geometry.stored
+    for k, outfit in enumerate(outfits):
+        old = known[trained.number_of(outfit)] if outfit in trained.outfits else known.mean(0)
+        model.geometry.stored[k] = old
 
 
 class Curves:

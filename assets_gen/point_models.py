@@ -1,0 +1,94 @@
+"""The points models that ship: training scans -> POP of all outfits, patches of each, test scans, manifest."""
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from workbench.body.model import Body
+from workbench.points.scans import ScanSequence, load_scans
+from workbench.points.trained_points import TrainedPatches, TrainedPoints
+from workbench.points.training_run import TrainPointsConfig, training_folder
+from workbench.points.training_run import run as train
+from workbench.store import add_to_manifest, code_version
+
+CODE = (
+    "workbench.points.training",
+    "workbench.points.training_run",
+    "workbench.points.clothed_points",
+    "workbench.points.pose_encoder",
+    "workbench.points.geometry_features",
+    "workbench.points.shape_decoder",
+    "workbench.points.patches",
+    "workbench.points.losses",
+    "workbench.learning.fit",
+)
+COMMAND = "python -m assets_gen points"
+
+
+@dataclass(frozen=True)
+class PointModelsConfig:
+    """Train what dresses bodies in points, POP and the patches it is compared with; record it with the test scans."""
+
+    # Scans in train/ and test/ (`python -m assets_gen scans`).
+    data: Path = Path("out/scans")
+    out: Path = Path("workbench/assets/points")
+    # Where the shipped scans go: some test scans, thinned.
+    scans: Path = Path("workbench/assets/scans")
+    # Where training keeps its state.
+    work: Path = Path("out/points")
+    # Test scans that ship, of each sequence.
+    frames: int = 3
+    pop: TrainPointsConfig = TrainPointsConfig()
+    patches: TrainPointsConfig = TrainPointsConfig(method="patches")
+
+
+def run(config: PointModelsConfig) -> None:
+    """Write pop.safetensors, patches-OUTFIT.safetensors, the test scans and their manifest entries."""
+    body = Body.default()
+    for training in (config.pop, config.patches):
+        for path in train(replace(training, data=config.data, out=config.work)):
+            kind = TrainedPatches if training.method == "patches" else TrainedPoints
+            _ship(path, config.out / path.name, dict(kind.load(path, body).story))
+    for scan in load_scans(config.data / "test"):
+        few = thinned(scan, config.frames)
+        target = config.scans / "test" / f"{scan.outfit}-{scan.motion}.npz"
+        few.save(target)
+        _record(target, {"frames": len(few), "of": len(scan)}, {})
+    _record_training_set(config)
+
+
+def thinned(scan: ScanSequence, frames: int) -> ScanSequence:
+    """So many scans of a sequence, evenly spread."""
+    return scan.every(max(1, -(-len(scan) // frames)))
+
+
+def _record_training_set(config: PointModelsConfig) -> None:
+    """Which scans the models learned from, by outfit and motion: they are not shipped."""
+    scans = load_scans(training_folder(config.data))
+    listed = [{"outfit": scan.outfit, "motion": scan.motion, "frames": len(scan)} for scan in scans]
+    target = config.out / "training_scans.json"
+    target.write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+    _record(target, {"scans": len(listed)}, {})
+
+
+def _ship(source: Path, target: Path, story: dict[str, Any]) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+    last = story["curves"][-1] if story["curves"] else {}
+    made_by = {key: value for key, value in story.items() if key != "curves"}
+    _record(target, made_by, {name: round(float(value), 5) for name, value in last.items()})
+
+
+def _record(target: Path, made_by: dict[str, Any], scores: dict[str, float]) -> None:
+    add_to_manifest(
+        target.parents[1 if target.parent.name != "test" else 2] / "manifest.json",
+        target,
+        command=COMMAND,
+        config=made_by,
+        seed=made_by.get("training", {}).get("seed"),
+        code=code_version(*CODE),
+        scores=scores,
+        licence="Apache-2.0",
+    )
