@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from widgets.plot import FigurePanel
 from workbench.evaluation_table import Row
@@ -59,7 +60,7 @@ def draw_rows(figure: Figure, rows: Sequence[Row]) -> None:
         colLabels=("figure", "measured", "bound", "holds"),
         colWidths=(0.62, 0.16, 0.14, 0.08),
         cellLoc="left",
-        bbox=(0, 0, 1, 1),
+        bbox=Bbox.unit(),
     )
     for cell in table.get_celld().values():
         cell.PAD = 0.02

@@ -13,8 +13,6 @@ from widgets.evaluation_view import list_view
 from widgets.fields_view import fields_view
 from widgets.garment_model_view import garment_model_view
 from widgets.inspection_panel import inspection_result_view, inspection_view
-from widgets.panel import Panel
-from widgets.plot import FigurePanel
 from widgets.projection_view import ProjectionComparison, comparison_view, projector_view, sequence_view
 from widgets.regressor_view import regressor_view
 from widgets.sdf_view import sdf_view
@@ -36,8 +34,9 @@ from workbench.tryon_demo import TryOnDemo
 
 
 @functools.singledispatch
-def view(result: Any, *others: Any, **options: Any) -> Panel | FigurePanel:
-    """A panel: `.scene`, `.live`, `.picture(size)`, `.page(path)`, `panel["latent"] = ...`.
+def view(result: Any, *others: Any, **options: Any) -> Any:
+    """A `widgets.panel.Panel`: `.scene`, `.live`, `.picture(size)`, `.page(path)`, `panel["latent"] = ...`;
+    a `widgets.plot.FigurePanel` where there are figures only.
 
     Errors: TypeError for what no stage makes.
     """

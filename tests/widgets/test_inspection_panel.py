@@ -31,7 +31,9 @@ def test_the_heat_map_is_the_inspection_s(found):
     draw_heat_map(figure, found, 1)
     counts = found.heat_map.numpy()
     hit = counts.any(axis=0)
-    np.testing.assert_array_equal(np.asarray(figure.axes[0].images[0].get_array().filled(0)), counts[:, hit].T)
+    drawn = figure.axes[0].images[0].get_array()
+    assert drawn is not None
+    np.testing.assert_array_equal(np.ma.filled(drawn, 0), counts[:, hit].T)
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
         name for name, there in zip(found.regions.names, hit) if there
     ]

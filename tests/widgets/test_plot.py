@@ -31,8 +31,8 @@ def test_curves_are_the_components_over_seconds_with_a_cursor():
     axes = Figure().subplots()
     curves(axes, values, 3.0, ("a", "b"), "title", frame=3)
     for component, line in enumerate(axes.lines[:2]):
-        np.testing.assert_array_equal(line.get_ydata(), values[:, component])
-        np.testing.assert_allclose(line.get_xdata(), np.arange(6) / 3)
+        np.testing.assert_array_equal(np.asarray(line.get_ydata()), values[:, component])
+        np.testing.assert_allclose(np.asarray(line.get_xdata()), np.arange(6) / 3)
     np.testing.assert_array_equal(axes.lines[2].get_xdata(), [1.0, 1.0])
 
 

@@ -39,7 +39,7 @@ def test_every_latent_is_drawn_once(motion):
     latents = np.random.default_rng(0).normal(size=(8, 25)).cumsum(0)
     figure = Figure()
     draw_latents(figure, latents, 30.0, 2)
-    drawn = [line.get_ydata() for line in figure.axes[0].lines if len(line.get_ydata()) == 8]
+    drawn = [np.asarray(line.get_ydata()) for line in figure.axes[0].lines if len(np.asarray(line.get_ydata())) == 8]
     assert len(drawn) == 25
     assert {tuple(line) for line in drawn} == {tuple(column) for column in latents.T}
     spread = np.sort(latents.std(0))[-NAMED:]
