@@ -15,15 +15,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from assets_gen.cloth_solver import ClothSolver
-from assets_gen.garments import DrapeConfig
 from assets_gen.motions import generate
 from assets_gen.simulations import RecordConfig, Task
 from workbench.body.model import Body
 from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.geometry.mesh import face_normals
-from workbench.geometry.winding import inside
 from workbench.npz import read_npz
 from workbench.store import atomic_write
 
@@ -188,39 +185,9 @@ def _heights(
     return height, normal, over & (found.distance < reach)
 
 
-def drape_outfit(outfit: Outfit, body: Body, config: DrapeConfig = DrapeConfig()) -> Outfit:
-    """All layers fall together onto the canonical body until they rest.  Raises ValueError if they do not."""
-    still = body.template.numpy()
-    within = int(inside(outfit.vertices.numpy(), still, body.faces.numpy()).sum())
-    if within:
-        raise ValueError(f"outfit {outfit.name!r}: {within} vertices start inside the body; cut its layers looser")
-    solver = ClothSolver(
-        still,
-        body.faces.numpy(),
-        outfit.rest_vertices.numpy(),
-        outfit.faces.numpy(),
-        outfit.vertices.numpy(),
-        config.cloth,
-    )
-    speed = np.inf
-    for _ in range(config.frames):
-        before = solver.positions
-        speed = float(np.linalg.norm(solver.advance(still) - before, axis=1).mean() * config.cloth.fps)
-        if speed < config.slowest and solver.frame > config.cloth.fps:
-            break
-    else:
-        raise ValueError(f"outfit {outfit.name!r} still moves at {1e3 * speed:.1f} mm/s after {config.frames} frames")
-    return Outfit(
-        outfit.name,
-        torch.from_numpy(solver.positions),
-        outfit.rest_vertices,
-        outfit.faces,
-        outfit.garment_of_vertex,
-        outfit.garments,
-    )
-
-
-def task_of(outfit: Outfit, motion: str, frames: int, betas: Float[Tensor, " K"], body: Body) -> Task:
+def task_of(
+    outfit: Outfit, motion: str, frames: int, betas: Float[Tensor, " K"], body: Body, record: RecordConfig
+) -> Task:
     """One simulation of an outfit over a generated motion, for `assets_gen.simulations.simulate`."""
     return Task(
         name=f"{outfit.name}-{motion}",
@@ -229,5 +196,5 @@ def task_of(outfit: Outfit, motion: str, frames: int, betas: Float[Tensor, " K"]
         # a simulation reads name, vertices, rest_vertices and faces, which both have; a Garment must be one sheet
         garment=cast(Garment, outfit),
         clear=True,
-        record=RecordConfig(),
+        record=record,
     )
