@@ -90,6 +90,15 @@ def test_a_cell_between_known_ones_needs_no_new_rows(body, model):
     assert nodes.row_count == rows
 
 
+def test_the_integers_reach_as_far_as_the_table_does(body, model):
+    betas = torch.linspace(-5, 5, 10)
+    nodes = TablePoser(body, model.fields, betas, 1).nodes
+    every = model.fields.layout.split(model.fields.grid.values)
+    pose = every.pose_directions.abs().amax((0, 2)).numpy()
+    shape = torch.einsum("k,nki->ni", betas, every.shape_directions).abs().amax()
+    assert (32767 * nodes.step >= np.append(float(shape), pose)).all()
+
+
 def test_other_fields_go_through_the_model(body, analytic_fields):
     rotations, translation, betas = random_pose(body, 8)
     model = GarmentModel(body, analytic_fields(body))

@@ -80,11 +80,6 @@ def test_two_ways_to_find_the_leaf_agree(grid, points):
     assert torch.equal(one.size, two.size)
 
 
-def test_no_value_is_larger_than_the_largest(grid, points):
-    assert torch.equal(grid.largest, grid.values.abs().amax(0))
-    assert bool((grid.at(points).abs() <= grid.largest + 1e-6).all())
-
-
 def test_outside_of_the_box_the_border_holds(grid):
     far = torch.tensor([[5.0, 0.1, 0.2]], requires_grad=True)
     value = grid.at(far)

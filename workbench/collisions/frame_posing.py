@@ -22,6 +22,7 @@ from workbench.geometry.warp_launch import Recorded, shared_array
 
 ROWS_INPUT = 4  # of `pose_points`: corners, then weights, then offsets
 CODES = 32767  # the largest integer of 16 bits
+SLACK = 5e-4  # metres by which the table's rounding can go beyond the fields
 
 
 class FramePoser(ABC):
@@ -54,13 +55,13 @@ class NodeRows:
     Grows by need; it never holds more rows than the table has nodes.
     """
 
-    def __init__(self, fields: GridFields, betas: Float[Tensor, "K"]):
+    def __init__(self, body: Body, fields: GridFields, betas: Float[Tensor, "K"]):
         self.fields, self.betas = fields, betas
         layout, grid = fields.layout, fields.grid
         self.offset_chunks = -(-(1 + layout.poses) // TRIPLES)
-        largest = layout.split(grid.largest[None])
-        shape = torch.einsum("k,nki->ni", betas.abs(), largest.shape_directions)
-        highest = torch.cat([shape[:, None], largest.pose_directions], dim=1).amax(-1)[0]
+        # the fields are averages over the body's surface: no larger anywhere than at its vertices
+        shape, pose = body.shape_offsets(betas), body.pose_directions.abs().amax((1, 2))
+        highest = torch.cat([shape.abs().amax()[None] + SLACK * betas.abs().sum(), pose + SLACK])
         self.step = (highest.clamp_min(1e-9) / CODES).numpy()  # of a displacement, metres
         self.child = grid.child.numpy().copy()  # of a leaf: -1, or -2 - its number here
         self.place = np.full(len(grid.values), -1, np.int32)  # of a node's row here
@@ -113,7 +114,7 @@ class TablePoser(FramePoser):
     """By the table and one kernel; float32 on the CPU."""
 
     def __init__(self, body: Body, fields: GridFields, betas: Float[Tensor, "K"], points: int):
-        joints, self.nodes = len(body.parents), NodeRows(fields, betas)
+        joints, self.nodes = len(body.parents), NodeRows(body, fields, betas)
         self.order = np.empty(points, np.int32)  # of the first garment along a Morton curve: neighbours share rows
         self.fresh = True
         self.rotations, self.translation = np.empty((joints, 3, 3), np.float32), np.empty((1, 3), np.float32)

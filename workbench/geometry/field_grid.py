@@ -106,11 +106,6 @@ class FieldGrid:
         return self.values.shape[1]
 
     @cached_property
-    def largest(self) -> Float[Tensor, "C"]:
-        """The largest size of each channel, anywhere."""
-        return torch.maximum(self.values.amax(0), -self.values.amin(0))
-
-    @cached_property
     def low(self) -> Float[Tensor, "3"]:
         return torch.from_numpy(self.compact.low.astype(np.float32))
 
