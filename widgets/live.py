@@ -48,8 +48,15 @@ class LiveScene(anywidget.AnyWidget):
         self.on_msg(self._answer)
 
     def renew(self, shown: Scene) -> None:
-        """Show another scene; frame and camera stay."""
-        wire = _encoded(shown, (self.size[0], self.size[1]))
+        """Show another scene; frame and camera stay.
+
+        A scene that is refused (ValueError as `widgets.wire.encode`) leaves the old one, and the view says why.
+        """
+        try:
+            wire = _encoded(shown, (self.size[0], self.size[1]))
+        except ValueError as reason:
+            self.tell(f"Not shown: {reason}")
+            raise
         known = self.scene["buffers"]
         buffers = {key: array.tobytes() for key, array in wire.arrays.items()}
         changed = [key for key in buffers if known.get(key) != buffers[key]]
@@ -79,8 +86,11 @@ class LiveScene(anywidget.AnyWidget):
             looked_at = replace(self._shown, camera=camera)
             pixels = picture(looked_at, (self.size[0], self.size[1]), int(message["frame"]), oversampling=1)
             self.send({"kind": "picture"}, [encoded(pixels, "JPEG")])
-        except (CannotDraw, ValueError) as reason:
-            self.send({"kind": "fault", "text": f"Neither the browser nor the kernel can draw: {reason}"})
+        except CannotDraw as reason:
+            self.tell(f"Neither the browser nor the kernel can draw: {reason}")
+        except Exception as reason:  # Jupyter would hide it in a log, and the view would wait for ever
+            self.tell(f"The kernel could not draw this: {reason}")
+            raise
 
 
 def _encoded(scene: Scene, size: tuple[int, int]) -> Wire:

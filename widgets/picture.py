@@ -230,7 +230,7 @@ def _light(plotter: Any, camera: Camera) -> None:
     """A studio: a soft key light, a weaker fill, a rim from behind; they stand still in the frame of view."""
     import pyvista as pv
 
-    target, position = np.array(camera.target), np.array(camera.position)
+    target, position = np.array(camera.target, float), np.array(camera.position, float)
     towards = position - target
     distance = float(np.linalg.norm(towards))
     towards /= distance

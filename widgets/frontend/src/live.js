@@ -4,6 +4,8 @@ import { NoWebGL } from "./stage.js";
 import { fault, mount } from "./view.js";
 import { stream } from "./stream.js";
 
+const GONE = "The kernel is gone: what its code would change stays as it is. Run the cell again.";
+
 // By the key that the kernel gave the model: anywidget hands initialize and render different objects for one model.
 const models = new Map();
 
@@ -31,7 +33,10 @@ function initialize({ model }) {
       arrays[key] = place < 0 ? entry.store.arrays[key] : typed(message.header.arrays[key], bytesOf(buffers[place]));
     }
     entry.store = { header: message.header, arrays };
-    for (const view of entry.views) view.renew({ ...entry.store });
+    for (const view of entry.views) {
+      view.renew({ ...entry.store });
+      view.note("");
+    }
   };
   model.on("msg:custom", onMessage);
   return () => {
@@ -43,6 +48,9 @@ function initialize({ model }) {
 function render({ model, el }) {
   const entry = storeOf(model);
   const [width, height] = model.get("size");
+  const host = document.createElement("div"); // el's own style belongs to the widget's layout
+  host.style.cssText = `width: 100%; max-width: ${width}px`;
+  el.append(host);
   let handle;
   const options = {
     width, height,
@@ -56,16 +64,15 @@ function render({ model, el }) {
       model.save_changes();
     },
   };
-  el.style.cssText = `width: 100%; max-width: ${width}px`;
   try {
     if (model.get("refuse_webgl")) throw new NoWebGL("switched off");
-    handle = mount(el, { ...entry.store }, options);
+    handle = mount(host, { ...entry.store }, options);
   } catch (error) {
     if (!(error instanceof NoWebGL)) {
-      fault(el, `The 3-D view could not be shown: ${error?.message ?? error}`);
+      fault(host, `The 3-D view could not be shown: ${error?.message ?? error}`);
       throw error;
     }
-    return stream(el, model, entry.store.header, [width, height], error.message);
+    return stream(host, model, entry.store.header, [width, height], error.message, GONE);
   }
   handle.setFrame(model.get("frame"), true);
   entry.views.add(handle);
@@ -73,10 +80,13 @@ function render({ model, el }) {
   const onMessage = (message) => {
     if (message.kind === "fault") handle.note(message.text);
   };
+  const onGone = () => handle.note(`${GONE} Turning, playing and reading still work.`);
   model.on("change:frame", onFrame);
+  model.on("comm_live_update", onGone);
   model.on("msg:custom", onMessage);
   return () => {
     model.off("change:frame", onFrame);
+    model.off("comm_live_update", onGone);
     model.off("msg:custom", onMessage);
     entry.views.delete(handle);
     handle.dispose();

@@ -4,14 +4,14 @@ import { element, fault } from "./view.js";
 const turned = ([x, y, z], angle) => [
   x * Math.cos(angle) - y * Math.sin(angle), x * Math.sin(angle) + y * Math.cos(angle), z];
 
-export function stream(host, model, header, [width, height], reason) {
+export function stream(host, model, header, [width, height], reason, gone) {
   const note = element("div", { class: "wbv-note", role: "alert", style: "padding:4px 8px;background:#fff4d6" },
     `No WebGL (${reason}): the kernel draws, more slowly. Drag to turn, wheel to zoom.`);
   const image = element("img", { class: "wbv-stream", draggable: "false", alt: "waiting for the kernel's picture",
     style: `width:100%;aspect-ratio:${width}/${height};display:block;background:#eee` });
   const root = element("div", { class: "wbv-fallback" }, note, image);
   host.append(root);
-  let { position, target, up, angle } = header.camera, frame = model.get("frame"), asked = false, again = false, waiting;
+  let { position, target, up, angle } = header.camera, frame = model.get("frame"), asked = false, again = false, waiting, told;
   const ask = () => {
     if (asked) return void (again = true);
     asked = true;
@@ -19,12 +19,19 @@ export function stream(host, model, header, [width, height], reason) {
     waiting = setTimeout(() => (note.textContent = "The kernel does not answer: it is busy or gone. Run the cell again."), 20000);
     model.send({ kind: "draw", camera: { position, target, up, angle }, frame });
   };
+  const onGone = () => (note.textContent = gone);
   const onMessage = (message, buffers) => {
-    if (message.kind === "renew") return ask();
+    if (message.kind === "renew") {
+      if (range) range.max = message.header.frames - 1;
+      frame = Math.min(frame, message.header.frames - 1);
+      return ask();
+    }
     if (message.kind !== "picture" && message.kind !== "fault") return;
     asked = false;
     clearTimeout(waiting);
-    if (message.kind === "fault") return void fault(root, message.text);
+    told?.remove();
+    told = message.kind === "fault" ? fault(root, message.text) : null;
+    if (told) return;
     const before = image.src;
     image.src = URL.createObjectURL(new Blob([buffers[0]], { type: "image/jpeg" }));
     if (before) URL.revokeObjectURL(before);
@@ -35,6 +42,7 @@ export function stream(host, model, header, [width, height], reason) {
     }
   };
   model.on("msg:custom", onMessage);
+  model.on("comm_live_update", onGone);
   let last = null;
   image.addEventListener("pointerdown", (event) => {
     last = [event.clientX, event.clientY];
@@ -57,14 +65,16 @@ export function stream(host, model, header, [width, height], reason) {
     position = position.map((p, i) => target[i] + (p - target[i]) * Math.exp(event.deltaY * 0.001));
     ask();
   });
-  if (header.frames > 1) {
-    const range = element("input", { type: "range", min: 0, max: header.frames - 1, value: frame, class: "wbv-range",
-      style: "width:100%", "aria-label": "frame", oninput: () => { frame = +range.value; ask(); } });
-    root.append(range);
-  }
+  const range = header.frames > 1
+    ? element("input", { type: "range", min: 0, max: header.frames - 1, value: frame, class: "wbv-range", style: "width:100%",
+        "aria-label": "frame", oninput: () => { frame = +range.value; ask(); },
+        onchange: () => { model.set("frame", frame); model.save_changes(); } })
+    : null;
+  if (range) root.append(range);
   ask();
   return () => {
     clearTimeout(waiting);
     model.off("msg:custom", onMessage);
+    model.off("comm_live_update", onGone);
   };
 }

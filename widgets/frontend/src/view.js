@@ -33,7 +33,9 @@ function addStyle(root) {
 }
 
 export function fault(host, text) {
-  host.append(element("div", { class: "wbv-fault", role: "alert" }, text));
+  const told = element("div", { class: "wbv-fault", role: "alert" }, text);
+  host.append(told);
+  return told;
 }
 
 /** Show `store` in `host`.  Raises NoWebGL.  Returns a handle; see `handle` at the end. */
@@ -449,6 +451,14 @@ class SceneView {
     this.drawCurve();
   }
 
+  /** A line over the view; "" takes it away. */
+  note(text) {
+    this.noted?.remove();
+    this.noted = text ? element("div", { class: "wbv-note", role: "alert" }, text) : null;
+    if (this.noted) this.root.insertBefore(this.noted, this.picture);
+    this.layout();
+  }
+
   /** Other arrays: in place where the structure is the same, else built anew with the camera kept. */
   renew(store) {
     const same = store.header.signature === this.header.signature;
@@ -493,7 +503,7 @@ class SceneView {
       onPick: (listener) => this.listeners.pick.add(listener),
       renew: (store) => this.renew(store),
       png: () => this.stage.png(),
-      note: (text) => this.root.insertBefore(element("div", { class: "wbv-note", role: "alert" }, text), this.picture),
+      note: (text) => this.note(text),
       dispose: () => {
         this.observer.disconnect();
         this.stage.dispose();
