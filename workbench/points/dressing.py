@@ -9,7 +9,8 @@ from torch import Tensor
 from workbench.body.model import Body
 from workbench.motion import Motion
 from workbench.points.clothed_points import ClothedPoints, PointModel, clothed
-from workbench.points.fast_decoder import FastDecoder
+from workbench.points.fast_decoder import FastDecoder, OutfitShare
+from workbench.points.lattice import Lattice
 from workbench.points.scans import ScanFrame
 from workbench.points.shape_decoder import CanonicalClothes, read_features
 from workbench.points.training import Precision, autocast
@@ -23,6 +24,7 @@ from workbench.points.uv_position_map import (
     posed_queries,
 )
 
+TOLERANCE = 1e-4  # metres; ours: half of what the published way and ours may differ by
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -38,17 +40,26 @@ class Dresser:
         queries: SurfaceQueries | None = None,
         query_size: int = QUERY_SIZE,
         precision: Precision = "float32",
+        tolerance: float = TOLERANCE,
     ):
         """geometry: smoothed features (`model.geometry(outfit)`, or `scan_fitting.features_of`); queries: where clothes
-        are asked for (default: every pixel of the query map that shows the body); precision: bfloat16 takes two thirds
-        of the time, but moves points by some hundredths of their displacement: for previews."""
+        are asked for, each of which is decoded (default: every pixel of the query map that shows the body, of which
+        about a third is decoded and the rest lies between them to within `tolerance`, metres); precision: bfloat16
+        takes two thirds of the time, but moves points by some hundredths of their displacement: for previews."""
         self.model, self.body = model.eval(), body
         self.precision: Precision = precision
-        self.queries = atlas_of(body, query_size).queries if queries is None else queries
+        self.tolerance = tolerance
         self._atlas = atlas_of(body, model.config.input_size)
         self._decoder = FastDecoder(model.decoder, model.config.encoder.features, DTYPES[precision])
-        with torch.no_grad():
-            self._share = self._decoder.share(self.queries.u, read_features(geometry, self.queries.u)[0])
+        self._lattice = Lattice.of(atlas_of(body, query_size)) if queries is None and tolerance > 0 else None
+        self.queries = atlas_of(body, query_size).queries if queries is None else queries
+        self._share = self._share_at(self.queries.u, geometry)
+        if self._lattice is not None:
+            self._corners_share = self._share_at(self._lattice.u, geometry)
+
+    @torch.no_grad()
+    def _share_at(self, u: Float[Tensor, "N 2"], geometry: Float[Tensor, "1 d h w"]) -> OutfitShare:
+        return self._decoder.share(u, read_features(geometry, u)[0])
 
     @torch.no_grad()
     def __call__(self, bodies: PosedBodies) -> ClothedPoints:
@@ -56,12 +67,22 @@ class Dresser:
         image = self._atlas.map_of(bodies.neutral)
         with autocast(self.precision):
             pose = self.model.encoder(image).float()
-        read = read_features(pose, self.queries.u)
-        frames = [self._decoder(z_P, self._share) for z_P in read]
+        frames = [self._decode(P[None]) for P in pose]
         canonical = CanonicalClothes(
             torch.stack([frame.displacement for frame in frames]), torch.stack([frame.normal for frame in frames])
         )
         return clothed(posed_queries(self.queries, bodies), canonical)
+
+    def _decode(self, pose: Float[Tensor, "1 c H W"]) -> CanonicalClothes:
+        if self._lattice is None:
+            return self._decoder(read_features(pose, self.queries.u)[0], self._share)
+        at_corners = self._decoder(read_features(pose, self._lattice.u)[0], self._corners_share)
+        canonical = self._lattice.clothes(at_corners)
+        doubtful = self._lattice.doubtful(at_corners.displacement, self.tolerance).nonzero()[:, 0]
+        exact = self._decoder(read_features(pose, self.queries.u[doubtful])[0], self._share.at(doubtful))
+        canonical.displacement[doubtful] = exact.displacement
+        canonical.normal[doubtful] = exact.normal
+        return canonical
 
     def animate(self, motion: Motion, betas: Float[Tensor, " K"]) -> Iterator[ScanFrame]:
         """Points and normals in the world, one frame of the motion after another."""

@@ -131,7 +131,7 @@ def forward_times(
         geometry = model.geometry(torch.tensor([0]))
     image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
     queries = atlas_of(body, query_size).queries
-    dresser = Dresser(model, geometry, body, queries=queries)
+    dresser = Dresser(model, geometry, body, query_size=query_size)
     plain = dress_every_pixel(model, geometry, image, queries, bodies, query_size)
     fast = dresser(bodies)
     apart = (plain.points - fast.points).norm(dim=-1).max().item()

@@ -8,7 +8,7 @@ the first and the fifth layer is computed once an outfit; rows go through all la
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from workbench.points.shape_decoder import SKIP_LAYER, CanonicalClothes, DecoderLayer, ShapeDecoder
@@ -26,6 +26,10 @@ class OutfitShare:
 
     def __len__(self) -> int:
         return len(self.first)
+
+    def at(self, index: Int[Tensor, " M"]) -> "OutfitShare":
+        """Some of the queries."""
+        return OutfitShare(self.first[index], self.skip[index])
 
 
 @dataclass(frozen=True, eq=False)
