@@ -18,7 +18,7 @@ from torch import Tensor
 from assets_gen.body import canonical_helpers
 from assets_gen.cloth_solver import ClothConfig
 from assets_gen.dataset import TEST_SHAPES, TRAINING_SHAPES, test_shapes, training_shapes
-from assets_gen.garments import OUTFITS, cut_garment, helper_quads
+from assets_gen.garments import DRAPED, OUTFITS, cut_garment, helper_quads
 from assets_gen.motions import FAMILIES
 from assets_gen.outfits import ENSEMBLES, Ensemble, put_on, task_of
 from assets_gen.scans import ScansConfig, scan_sequence
@@ -32,9 +32,15 @@ from workbench.store import Store, add_to_manifest, code_version, describe
 log = logging.getLogger(__name__)
 
 ASSETS = Path("workbench/assets")
-ALONE = ("tshirt", "dress")  # the first paper's garments: simulated by assets_gen.dataset
 CUT_BY = ("assets_gen.garments",)  # a change cuts anew
 MOST_INSIDE = 20  # vertices (0.3 %) inside the body that a scanned frame may have: pinched in folds, points hide them
+# which of the dataset's motions are scanned: a family each, on as many shapes as there are
+SCANNED_ALONE = {
+    "tshirt": ("walk_00", "dance_01", "squat_02", "reach_03", "kick_04", "punch_05", "jump_06", "twist_07", "turn_08")
+    + ("excursion_09", "test_lunge_00", "test_wave_00", "test_jack_00"),
+    "dress": ("dance_04", "squat_04", "kick_04", "reach_04", "twist_04", "excursion_04", "jump_04", "turn_04")
+    + ("test_lunge_00", "test_wave_00", "test_jack_00"),
+}
 TEST_ROUND = 1  # the second round holds the test motions
 FIRST_TEST = 4  # index of the first outfit's test family; with 10 outfits none gets `bow`, which crushes cloth
 HELD_OUT = {ensemble.name for ensemble in ENSEMBLES if ensemble.held_out}
@@ -88,12 +94,12 @@ def plan(config: OutfitsConfig, body: Body) -> list[list[PlannedOutfit]]:
     train, test = training_shapes(body), test_shapes(body)
     seen = [name for name, family in FAMILIES.items() if family.split == "train"]
     unseen = [name for name, family in FAMILIES.items() if family.split == "test"]
-    ensembles = [ensemble for ensemble in ENSEMBLES if ensemble.name not in ALONE]
+    ensembles = [ensemble for ensemble in ENSEMBLES if ensemble.name not in DRAPED]
     unknown = sorted(set(config.only) - {ensemble.name for ensemble in ensembles})
     if unknown:
         raise ValueError(
             f"no outfit is called {', '.join(unknown)}; there are {', '.join(e.name for e in ensembles)}"
-            f" ({' and '.join(ALONE)} are made by python -m assets_gen dataset)"
+            f" ({' and '.join(DRAPED)} are made by python -m assets_gen dataset)"
         )
     rounds = []
     for round_ in range(config.rounds):
@@ -132,7 +138,7 @@ def run(config: OutfitsConfig) -> tuple[Path, ...]:
     rounds = plan(config, body)
     used = {layer for round_ in rounds for one in round_ for layer in one.ensemble.layers}
     garments = layers(sorted(used), body, config.out / "garments")
-    scans = _scan_alone(config, body)
+    scans = _scan_single(config, body)
     for planned in rounds:
         tasks = [_task(config, body, garments, one) for one in planned]
         request = SimulationsConfig(
@@ -162,13 +168,14 @@ def _task(config: OutfitsConfig, body: Body, garments: dict[str, Garment], one: 
     return task_of(worn, one.motion, config.frames, one.betas, body, config.record)
 
 
-def _scan_alone(config: OutfitsConfig, body: Body) -> list[Path]:
+def _scan_single(config: OutfitsConfig, body: Body) -> list[Path]:
     if config.sequences is None:
         return []
-    sources = sorted(path for name in ALONE for path in config.sequences.glob(f"{name}-*.npz"))
+    wanted = [f"{garment}-{motion}-" for garment, motions in SCANNED_ALONE.items() for motion in motions]
+    sources = sorted(path for path in config.sequences.glob("*.npz") if path.name.startswith(tuple(wanted)))
     if not sources:
         raise ValueError(
-            f"no sequences of {' or '.join(ALONE)} in {config.sequences}; make them with assets_gen dataset"
+            f"no sequences of {' or '.join(DRAPED)} in {config.sequences}; make them with assets_gen dataset"
         )
     return [scan for path in sources for scan in _scanned(config, body, path)]
 

@@ -8,7 +8,17 @@ import pytest
 import torch
 
 from assets_gen.motions import FAMILIES
-from assets_gen.outfit_dataset import HELD_OUT, MOST_INSIDE, OutfitsConfig, compact, plan, run, scannable, split_of
+from assets_gen.outfit_dataset import (
+    HELD_OUT,
+    MOST_INSIDE,
+    SCANNED_ALONE,
+    OutfitsConfig,
+    compact,
+    plan,
+    run,
+    scannable,
+    split_of,
+)
 from assets_gen.outfits import ENSEMBLES
 from workbench.body.model import Body
 from workbench.collisions.sequences import SHIPPED, SimulatedSequence
@@ -101,3 +111,10 @@ def test_a_pinched_vertex_is_forgiven_a_torn_garment_is_not():
     assert not judged(inside=MOST_INSIDE + 1)
     assert not judged(usual=record.usual_stretch + 0.01)
     assert not judged(rare=record.rare_stretch + 0.01)
+
+
+def test_single_garments_are_scanned_on_one_motion_a_family():
+    for motions in SCANNED_ALONE.values():
+        families = [motion.rpartition("_")[0] for motion in motions]
+        assert len(set(families)) == len(families)
+        assert {FAMILIES[name].split for name in families} == {"train", "test"}
