@@ -8,7 +8,9 @@ import torch
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TorchNetworks, TryOn
-from workbench.collisions.tryon_kernels import KernelNetworks
+from workbench.collisions.tryon_kernels import KernelNetworks, quickest
+from workbench.collisions.tryon_onnx import OnnxNetworks
+from workbench.extras import MissingExtra
 from workbench.formats import load_motion, motion_files
 
 
@@ -64,3 +66,15 @@ def test_a_dense_decoder_is_refused(tryon):
     dense = Subspace("tshirt", Statistics.blank(tryon.subspace.vertex_count, config), config)
     with pytest.raises(ValueError, match="no dense last layer"):
         KernelNetworks(tryon.regressor, dense)
+
+
+def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
+    assert isinstance(quickest(tryon).networks, KernelNetworks)
+    fresh = replace(tryon, regressor=Regressor("tshirt", 31, 10, 30.0, torch.Generator().manual_seed(0)))
+    assert isinstance(quickest(fresh).networks, OnnxNetworks)
+
+    def absent(regressor, subspace):
+        raise MissingExtra("no onnxruntime")
+
+    monkeypatch.setattr("workbench.collisions.tryon_kernels.OnnxNetworks", absent)
+    assert quickest(fresh) is fresh

@@ -177,10 +177,12 @@ class TablePoser(FramePoser):
         """Read the rows that this frame is the first to need."""
         unknown = self.leaf < 0
         cells = -1 - self.leaf[unknown]
+        before = self.nodes.weights, self.nodes.corners
         self.nodes.add(np.unique(cells))
         self.leaf[unknown] = -2 - self.nodes.child[cells]
-        for index, array in enumerate(self._rows()):
-            self._pose.replace(ROWS_INPUT + index, array)
+        if before[0] is not self.nodes.weights or before[1] is not self.nodes.corners:  # they moved to have more room
+            for index, array in enumerate(self._rows()):
+                self._pose.replace(ROWS_INPUT + index, array)
 
     def _rows(self) -> tuple[wp.array, wp.array, wp.array]:
         nodes = self.nodes

@@ -4,6 +4,9 @@ A frame reads every weight once and computes little with it, so bytes are what i
 float16; here they stay so, sums are in float32: torch's numbers from half the bytes, and without onnxruntime.
 """
 
+import contextlib
+from dataclasses import replace
+
 import numpy as np
 import torch
 import warp as wp
@@ -13,7 +16,9 @@ from torch import Tensor, nn
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, Subspace
-from workbench.collisions.tryon import Networks
+from workbench.collisions.tryon import Networks, TryOn
+from workbench.collisions.tryon_onnx import OnnxNetworks
+from workbench.extras import MissingExtra
 from workbench.geometry.warp_launch import Recorded, shared_array
 
 
@@ -105,3 +110,11 @@ class KernelNetworks(Networks):
         self.amounts[:LATENTS] += self.latent
         self.spread.call()
         return torch.from_numpy(self.spread.outputs.copy()).reshape(-1, 3)
+
+
+def quickest(tryon: TryOn) -> TryOn:
+    """The same with the quickest networks there are: these kernels, else onnxruntime, else torch as it is."""
+    for networks in (KernelNetworks, OnnxNetworks):
+        with contextlib.suppress(ValueError, MissingExtra):
+            return replace(tryon, networks=networks(tryon.regressor, tryon.subspace))
+    return tryon
