@@ -2,13 +2,15 @@
 # lab    the same, then JupyterLab at the map notebook
 # test   the whole test suite with the notebooks
 # check  ruff, pyright, import-linter
+# html   the notebooks as pages with pictures, out/notebooks, for people without Python
 
 PYTHON ?= python3
 WORKERS ?= 2
 BIN := .venv/bin
 OUT ?= out/demo
+PAGES ?= out/notebooks
 
-.PHONY: demo lab test check
+.PHONY: demo lab test check html
 .DEFAULT_GOAL := demo
 
 demo: .venv/installed-core
@@ -20,6 +22,14 @@ lab: .venv/installed-lab
 # One thread a worker: two workers share two cores. Files stay together, so that what a file prepares is made once.
 test: .venv/installed-test
 	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --nbmake
+
+# Pictures come before widgets, which a page without a kernel cannot show; links lead from page to page.
+html: .venv/installed-lab
+	$(BIN)/jupyter nbconvert --to html --execute --output-dir $(PAGES) notebooks/*.ipynb \
+	  --NbConvertBase.display_data_priority="['image/png', 'text/html', 'text/markdown', 'text/plain']"
+	@sed -i.bak 's/\.ipynb"/.html"/g' $(PAGES)/*.html && rm $(PAGES)/*.html.bak
+	@for page in $(PAGES)/*.html; do \
+	  grep -q 'data:image/png;base64' "$$page" || { echo "$$page has no picture"; exit 1; }; done
 
 check: .venv/installed-test
 	$(BIN)/ruff check .
