@@ -1,7 +1,8 @@
 """Sec. 6: the training set.  garment -> sequences simulated over motions and shapes, projected, in a compact form.
 
 The plan: every training family of motions gives PER_FAMILY motions (random excursions twice as many), motion i on
-training shape i, so that each shape meets each family; test sequences pair test families with test shapes.
+training shape i, so that each shape meets each family; with fewer motions than shapes, the shapes are dealt out in
+turn and the last one is kept for validation. Test sequences pair test families with test shapes.
 """
 
 import logging
@@ -103,11 +104,20 @@ def plan(config: DatasetConfig, body: Body) -> list[PlannedSequence]:
         planned.append(PlannedSequence(name, test[index % TEST_SHAPES], "test"))
     for round_ in range(config.per_family):
         split = "validation" if round_ == config.per_family - 1 else "train"
-        for family in families:
-            planned.append(PlannedSequence(f"{family}_{round_:02d}", train[round_ % TRAINING_SHAPES], split))
         again = config.per_family + round_
-        planned.append(PlannedSequence(f"{LIVELY}_{again:02d}", train[(again + 5) % TRAINING_SHAPES], split))
+        names = [f"{family}_{round_:02d}" for family in families] + [f"{LIVELY}_{again:02d}"]
+        shapes = _dealt(config.per_family, round_, len(names))
+        planned += [PlannedSequence(name, train[shape], split) for name, shape in zip(names, shapes, strict=True)]
     return planned
+
+
+def _dealt(rounds: int, round_: int, count: int) -> list[int]:
+    """Indices of the training shapes of a round's motions, the last of them the lively one."""
+    if rounds >= TRAINING_SHAPES:
+        return [round_ % TRAINING_SHAPES] * (count - 1) + [(rounds + round_ + 5) % TRAINING_SHAPES]
+    if round_ == rounds - 1:
+        return [TRAINING_SHAPES - 1] * count
+    return [(round_ * count + k) % (TRAINING_SHAPES - 1) for k in range(count)]
 
 
 def simulated(config: DatasetConfig, body: Body) -> tuple[list[PlannedSequence], list[Path | None]]:

@@ -1,4 +1,4 @@
-"""The networks of the try-on that ship: training set -> subspace, regressor and its variant of Tab. 1, manifest."""
+"""The networks of the try-on that ship: training set -> subspace, regressor, corrective; the rows of Tab. 1."""
 
 import json
 import shutil
@@ -6,21 +6,36 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from workbench.collisions.regressor import RegressorWeights, TrainRegressorConfig
+import torch
+
+from workbench.body.model import Body
+from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet, Projected, compact
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.posed_corrective import TrainCorrectiveConfig
+from workbench.collisions.posed_corrective import run as train_corrective
+from workbench.collisions.projection_baselines import constant_weights
+from workbench.collisions.regressor import TrainRegressorConfig
 from workbench.collisions.regressor import run as train_regressor
-from workbench.collisions.subspace import TrainSubspaceConfig
+from workbench.collisions.subspace import LossWeights, TrainSubspaceConfig
 from workbench.collisions.subspace import run as train_subspace
-from workbench.learning.fit import FitConfig
+from workbench.garments import Garment
 from workbench.store import add_to_manifest, code_version
 
 CODE = (
     "workbench.collisions.subspace",
     "workbench.collisions.regressor",
     "workbench.collisions.motion_descriptor",
+    "workbench.collisions.posed_corrective",
     "workbench.collisions.posed_collision",
     "workbench.learning.fit",
 )
-PAPER = ".paper"  # Tab. 1, "our method": without the term in posed space
+# Tab. 1: what each row leaves out of Eq. 13
+ABLATIONS = {
+    ".unsupervised": LossWeights(self_supervised=False),
+    ".plain": LossWeights(self_supervised=False, collision=0.0),
+    ".2019": LossWeights(self_supervised=False, collision=0.0),  # in the constant-weight unposed space
+}
 
 
 @dataclass(frozen=True)
@@ -29,28 +44,61 @@ class ModelsConfig:
 
     garment: str = "tshirt"
     out: Path = Path("workbench/assets/models")
-    work: Path = Path("out/models")  # where training keeps its state
+    work: Path = Path("out/models")  # where training keeps its state, and the ablations stay
     subspace: TrainSubspaceConfig = TrainSubspaceConfig()
     regressor: TrainRegressorConfig = TrainRegressorConfig()
-    # the full model starts from the paper's and learns the posed-space term
-    refine: FitConfig = FitConfig(steps=1000, learning_rate=3e-4)
+    corrective: TrainCorrectiveConfig = TrainCorrectiveConfig()
+    ablations: tuple[str, ...] = ()
+    """rows of Tab. 1 to train instead, into `work`: .unsupervised .plain .2019"""
 
 
 def run(config: ModelsConfig) -> None:
-    """Write GARMENT-subspace, GARMENT-regressor and GARMENT.paper-regressor.safetensors, and their manifest entries."""
-    subspace = train_subspace(replace(config.subspace, garment=config.garment, out=config.work))
-    _record(config, f"{config.garment}-subspace.safetensors", subspace.story)
-    paper = replace(config.regressor, garment=config.garment, out=config.work, suffix=PAPER, weights=RegressorWeights())
-    full = replace(
-        paper,
-        suffix="",
-        start=config.work / f"{config.garment}{PAPER}-regressor.safetensors",
-        weights=config.regressor.weights,
-        fit=config.refine,
-    )
-    for variant in (paper, full):
-        regressor = train_regressor(variant)
-        _record(config, f"{config.garment}{variant.suffix}-regressor.safetensors", regressor.story)
+    """Write GARMENT-subspace, -regressor and -corrective.safetensors with their manifest entries, or ablations."""
+    if config.ablations:
+        for suffix in config.ablations:
+            ablation(config, suffix)
+        return
+    here: dict[str, Any] = {"garment": config.garment, "out": config.work}
+    stories = {
+        "subspace": train_subspace(replace(config.subspace, **here)).story,
+        "regressor": train_regressor(replace(config.regressor, **here)).story,
+        "corrective": train_corrective(replace(config.corrective, **here)).story,
+    }
+    for stage, story in stories.items():
+        _record(config, f"{config.garment}-{stage}.safetensors", story)
+
+
+def ablation(config: ModelsConfig, suffix: str) -> None:
+    """A row of Tab. 1: subspace and regressor of the same sizes and steps, without what the row leaves out."""
+    if suffix not in ABLATIONS:
+        raise ValueError(f"there is no ablation {suffix!r}; Tab. 1 has {', '.join(ABLATIONS)}")
+    data = config.subspace.data
+    if suffix == ".2019":
+        data = config.work / f"{config.garment}-constant.npz"
+        if not data.is_file():
+            unposed_by_constant_weights(CanonicalSet.shipped(config.garment)).save(data)
+    here: dict[str, Any] = {"garment": config.garment, "out": config.work, "suffix": suffix, "data": data}
+    train_subspace(replace(config.subspace, weights=ABLATIONS[suffix], **here))
+    train_regressor(replace(config.regressor, **here))
+
+
+def unposed_by_constant_weights(data: CanonicalSet) -> CanonicalSet:
+    """The training set in the space of earlier work: posed again, unposed with each vertex's constant rigging."""
+    body, garment = Body.default(), Garment.load(data.garment_name)
+    model, projected = GarmentModel(body, GridFields.default()), []
+    for s in data.sequences:
+        parts = []
+        for part in torch.arange(len(s)).split(32):
+            state = model.state(s.rotations[part], s.betas, s.translation[part])
+            posed = model.posed(data.garments(s.coefficients[part]), state)
+            parts.append(constant_weights(body, garment.vertices, posed, state))
+        X = torch.cat(parts)
+        bare = CanonicalSequence(
+            torch.zeros(len(s), 0), s.rotations, s.translation, s.betas, s.valid, s.motion_name, s.split
+        )
+        projected.append(Projected(X, bare))
+    generator = torch.Generator().manual_seed(0)
+    return compact(projected, data.garment_name, data.fps, rank=data.rank, generator=generator)
 
 
 def _record(config: ModelsConfig, file: str, story: dict[str, Any]) -> None:

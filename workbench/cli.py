@@ -37,6 +37,7 @@ TRAININGS = {
     "fields": ("workbench.collisions.field_training", "TrainFieldsConfig"),
     "subspace": ("workbench.collisions.subspace", "TrainSubspaceConfig"),
     "regressor": ("workbench.collisions.regressor", "TrainRegressorConfig"),
+    "corrective": ("workbench.collisions.posed_corrective", "TrainCorrectiveConfig"),
     "points": ("workbench.points.training_run", "TrainPointsConfig"),
 }
 

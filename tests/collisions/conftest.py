@@ -1,4 +1,4 @@
-"""Smooth fields with known formulas and exact gradients, in any precision: a stand-in for Eq. 4-6 in tests."""
+"""Stand-ins: smooth fields with known formulas and exact gradients for Eq. 4-6; a small training set."""
 
 import pytest
 import torch
@@ -6,7 +6,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
+from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
 from workbench.collisions.diffused_body import FieldValues, LinearFields
+from workbench.garments import Garment
+from workbench.geometry.rotations import axis_angle_to_matrix
 
 
 class AnalyticFields(LinearFields):
@@ -33,3 +36,27 @@ class AnalyticFields(LinearFields):
 def analytic_fields() -> type[AnalyticFields]:
     """The class: `analytic_fields(body)` makes the fields of a body."""
     return AnalyticFields
+
+
+@pytest.fixture(scope="session")
+def small_set(body) -> CanonicalSet:
+    garment = Garment.load("tshirt")
+    generator = torch.Generator().manual_seed(0)
+    smooth = torch.sin(garment.vertices[None] * torch.rand(30, 1, 3, generator=generator) * 9)
+    rows = torch.linalg.qr(smooth.flatten(1).T).Q.T * len(garment.vertices) ** 0.5
+
+    def sequence(seed: int, split: str) -> CanonicalSequence:
+        chance = torch.Generator().manual_seed(seed)
+        turns = 0.03 * torch.randn(24, len(body.parents), 3, generator=chance).cumsum(0)
+        return CanonicalSequence(
+            coefficients=0.002 * torch.randn(24, 30, generator=chance).cumsum(0),
+            rotations=axis_angle_to_matrix(turns),
+            translation=0.01 * torch.randn(24, 3, generator=chance).cumsum(0),
+            betas=torch.randn(10, generator=chance),
+            valid=torch.rand(24, generator=chance) > 0.1,
+            motion_name=f"walk_{seed}",
+            split=split,
+        )
+
+    sequences = (sequence(1, "train"), sequence(2, "train"), sequence(3, "validation"))
+    return CanonicalSet("tshirt", garment.vertices, rows.unflatten(1, (-1, 3)), sequences, 30.0, 0.0)

@@ -8,10 +8,8 @@ import onnxruntime
 import pytest
 import torch
 
-from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
 from workbench.collisions.regressor import (
     Regressor,
-    RegressorWeights,
     TrainRegressorConfig,
     acceleration_loss,
     position_loss,
@@ -22,36 +20,11 @@ from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TryOn, checked_shape, shape_from_words
 from workbench.collisions.tryon_onnx import OnnxNetworks, write_onnx
 from workbench.formats.mesh_sequence import read_dressed_sequence
-from workbench.garments import Garment
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
 from workbench.motion import Motion
 
 NETWORK = NetworkConfig(width=32, depth=2, rank=30)
-
-
-@pytest.fixture(scope="module")
-def small_set(body) -> CanonicalSet:
-    garment = Garment.load("tshirt")
-    generator = torch.Generator().manual_seed(0)
-    smooth = torch.sin(garment.vertices[None] * torch.rand(30, 1, 3, generator=generator) * 9)
-    rows = torch.linalg.qr(smooth.flatten(1).T).Q.T * len(garment.vertices) ** 0.5
-
-    def sequence(seed: int, split: str) -> CanonicalSequence:
-        chance = torch.Generator().manual_seed(seed)
-        turns = 0.03 * torch.randn(24, len(body.parents), 3, generator=chance).cumsum(0)
-        return CanonicalSequence(
-            coefficients=0.002 * torch.randn(24, 30, generator=chance).cumsum(0),
-            rotations=axis_angle_to_matrix(turns),
-            translation=0.01 * torch.randn(24, 3, generator=chance).cumsum(0),
-            betas=torch.randn(10, generator=chance),
-            valid=torch.rand(24, generator=chance) > 0.1,
-            motion_name=f"walk_{seed}",
-            split=split,
-        )
-
-    sequences = (sequence(1, "train"), sequence(2, "train"), sequence(3, "validation"))
-    return CanonicalSet("tshirt", garment.vertices, rows.unflatten(1, (-1, 3)), sequences, 30.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -174,11 +147,9 @@ def trained(small_set, tmp_path_factory) -> TrainRegressorConfig:
         out=folder,
         window=10,
         batch=3,
-        posed_frames=1,
         describe=few,
         fit=few,
         watch_every=2,
-        weights=RegressorWeights(posed=1.0),
     )
 
 

@@ -5,10 +5,11 @@ each shape (facts.md 9); the raw motions stand beside.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,9 +18,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from workbench.body.model import Body
-from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.diffused_body import DiffusedFields, GridFields
 from workbench.collisions.garment_model import GarmentModel
-from workbench.collisions.penetration import penetration
+from workbench.collisions.penetration import penetration, surface_penetration
+from workbench.collisions.posed_corrective import PosedCorrective
+from workbench.collisions.projection_baselines import constant_fields
+from workbench.collisions.push_out import bulge, push_out
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.sequences import SimulatedSequence, shipped_tests
 from workbench.collisions.subspace import SHIPPED, Subspace
@@ -27,16 +31,19 @@ from workbench.collisions.subspace_evaluation import trained_garments, wrinkles
 from workbench.collisions.tryon import TryOn
 from workbench.evaluation_table import Row, at_least, at_most, told, within
 from workbench.formats import load_motion, motion_files
+from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.geometry.laplacian import umbrella_laplacian
 from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
+R = TypeVar("R")
 
 MILLI, PERCENT = 1e3, 100.0
 SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there (facts.md 9)
 ALLOWED = {"tshirt": 0.05, "dress": 0.10}  # percent
 ALLOWED_ON_MOCAP = 0.09  # percent: the paper's full model on AMASS
+FAR_SHAPES = (1.0, 2.0, 3.0, 4.0, 5.0)  # Fig. 6: largest component, standard deviations; training is cut at 2.5
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,7 @@ class CollisionEvaluation:
     shapes_a_motion: int = 20  # each motion is worn by so many of them, in turn
     every: int = 5  # frames: one in so many is counted
     raw: bool = True  # also the motions as they came
+    figures: bool = True  # Fig. 6 (far shapes) and Fig. 7 (the post-process), and edges and faces that cross
     seed: int = 11
 
 
@@ -68,6 +76,12 @@ def rows(config: CollisionEvaluation) -> list[Row]:
                 table += collision_rows(f"{name}, {variant}, raw motion", tryon, worn, config, None)
             if config.motions is None:
                 table += fidelity_rows(f"{name}, {variant}", tryon)
+        if config.figures and variants:
+            label, tryon = next(iter(variants.items()))
+            table += surface_rows(f"{name}, {label}", tryon, cleared, config)
+            table += push_rows(f"{name}, {label}", tryon, worn, config)
+            if config.motions is None:
+                table += far_shape_rows(f"{name}, {label}", tryon, motions, config)
     return table
 
 
@@ -93,28 +107,42 @@ def _cleared(worn: Sequence[tuple[Motion, Tensor]], body: Body) -> list[tuple[Mo
     return [(motion, betas) for motion, (_, betas) in zip(done, worn, strict=True)]
 
 
+@dataclass(frozen=True)
+class Variant:
+    """A row of Tab. 1: which files of a garment it is made of, by what stands between the name and the stage."""
+
+    label: str
+    subspace: str = ""
+    regressor: str = ""
+    corrective: bool = False
+    fields: Callable[[Body, Garment], DiffusedFields] = lambda body, garment: GridFields.default()
+
+
+VARIANTS = (
+    Variant("full with the posed-space corrective", corrective=True),
+    Variant("the paper's full model"),
+    Variant("without self-supervision", ".unsupervised", ".unsupervised"),
+    Variant("without collision loss", ".plain", ".plain"),
+    Variant("2019-style", ".2019", ".2019", fields=constant_fields),
+)
+
+
 def load_variants(garment: str, folder: Path) -> dict[str, TryOn]:
-    """The models of Tab. 1 that a folder has, best first: files GARMENT[.variant]-regressor.safetensors."""
-    model = GarmentModel(Body.default(), GridFields.default())
+    """The models of Tab. 1 that a folder has, best first."""
     found: dict[str, TryOn] = {}
-    for suffix, label in VARIANTS.items():
-        regressor = folder / f"{garment}{suffix}-regressor.safetensors"
-        subspace = folder / f"{garment}{SUBSPACE_OF.get(suffix, '')}-subspace.safetensors"
-        if regressor.is_file() and subspace.is_file():
-            found[label] = TryOn.of(Subspace.load(subspace), Regressor.load(regressor), model)
-    missing = [label for label in VARIANTS.values() if label not in found]
+    body = Body.default()
+    for variant in VARIANTS:
+        subspace = folder / f"{garment}{variant.subspace}-subspace.safetensors"
+        regressor = folder / f"{garment}{variant.regressor}-regressor.safetensors"
+        corrective = PosedCorrective.beside(folder, garment) if variant.corrective else None
+        if subspace.is_file() and regressor.is_file() and (corrective is not None or not variant.corrective):
+            model = GarmentModel(body, variant.fields(body, Garment.load(garment)))
+            networks = Subspace.load(subspace), Regressor.load(regressor)
+            found[variant.label] = TryOn.of(*networks, model, corrective)
+    missing = [variant.label for variant in VARIANTS if variant.label not in found]
     if missing:
         log.warning("%s: no networks in %s for: %s", garment, folder, ", ".join(missing))
     return found
-
-
-VARIANTS = {
-    "": "full with the posed-space term",
-    ".paper": "the paper's full model",
-    ".unsupervised": "without self-supervision",
-    ".plain": "without collision loss",
-}
-SUBSPACE_OF = {".unsupervised": ".unsupervised", ".plain": ".plain"}
 
 
 @dataclass(frozen=True)
@@ -146,30 +174,111 @@ def collision_rows(
 def count(tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], every: int) -> Counted:
     """Dress every motion on its shape; count one frame in `every`."""
 
-    @torch.no_grad()
-    def one(pair: tuple[Motion, Tensor]) -> tuple[np.ndarray, np.ndarray]:
-        motion, betas = pair
-        latent = tryon.latents(motion, betas)
-        index = torch.arange(0, len(motion), every)
-        rotations, translation = motion.rotations[index], motion.translation[index]
-        garment = tryon.model.posed(
-            tryon.subspace.decode(latent[index]), tryon.model.state(rotations, betas, translation)
-        )
-        bodies = tryon.model.body.vertices(rotations, betas, translation)
-        found = penetration(bodies, tryon.model.body.faces, garment)
+    def one(dressed: DressedFrames) -> tuple[np.ndarray, np.ndarray]:
+        found = penetration(dressed.bodies, tryon.model.body.faces, dressed.garment)
         return found.inside.float().mean(1).numpy(), found.overlap.float().mean(1).numpy()
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # a thread a sequence
-    try:
-        with ThreadPoolExecutor(2) as pool:
-            done = list(tqdm(pool.map(one, worn), total=len(worn), desc="dress", mininterval=5.0))
-    finally:
-        torch.set_num_threads(threads)
-    inside, overlap = (np.concatenate(column) for column in zip(*done, strict=True))
+    inside, overlap = (np.concatenate(column) for column in zip(*dressed_each(tryon, worn, every, one), strict=True))
     return Counted(
         float(inside.mean()), float(overlap.mean()), float(inside.max()), float((inside == 0).mean()), len(inside)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class DressedFrames:
+    """Some frames of a dressed motion."""
+
+    garment: Float[Tensor, "T N 3"]
+    bodies: Float[Tensor, "T V 3"]
+
+
+def dressed(tryon: TryOn, motion: Motion, betas: Float[Tensor, "K"], every: int = 1) -> DressedFrames:
+    """One frame in `every` of a motion; the regressor sees all of them."""
+    with torch.no_grad():
+        index = torch.arange(0, len(motion), every)
+        rotations, translation = motion.rotations[index], motion.translation[index]
+        X = tryon.canonical(motion, betas, every)
+        garment = tryon.model.posed(X, tryon.model.state(rotations, betas, translation))
+        return DressedFrames(garment, tryon.model.body.vertices(rotations, betas, translation))
+
+
+def dressed_each(
+    tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], every: int, measure: Callable[[DressedFrames], R]
+) -> list[R]:
+    """`measure` of every dressed motion, a thread a sequence."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            work = pool.map(lambda pair: measure(dressed(tryon, pair[0], pair[1], every)), worn)
+            return list(tqdm(work, total=len(worn), desc="dress", mininterval=5.0))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def per_frame(tryon: TryOn, motion: Motion, betas: Float[Tensor, "K"], every: int = 1) -> Float[np.ndarray, "T"]:
+    """Fig. 5: the share of vertices inside the body, frame by frame, 0..1."""
+    frames = dressed(tryon, motion, betas, every)
+    return penetration(frames.bodies, tryon.model.body.faces, frames.garment).inside.float().mean(1).numpy()
+
+
+def surface_rows(
+    label: str, tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], config: CollisionEvaluation
+) -> list[Row]:
+    """Edges and faces of the garment that cross the body, and those that no vertex shows."""
+
+    def one(frames: DressedFrames) -> np.ndarray:
+        found = surface_penetration(frames.bodies, tryon.model.body.faces, frames.garment, tryon.garment.faces)
+        masks = (found.crossing_edges, found.hidden_edges, found.crossing_faces, found.hidden_faces)
+        return len(frames.garment) * np.array([1.0, *(float(mask.float().mean()) for mask in masks)])
+
+    frames, *shares = np.sum(dressed_each(tryon, worn, 4 * config.every, one), axis=0)
+    names = ("edges crossing", "of it with both ends outside", "faces crossing", "of it with all corners outside")
+    return [
+        told(f"{label}: {name}, {frames:g} frames", PERCENT * share / frames, "%")
+        for name, share in zip(names, shares, strict=True)
+    ]
+
+
+def push_rows(
+    label: str, tryon: TryOn, worn: Sequence[tuple[Motion, Tensor]], config: CollisionEvaluation
+) -> list[Row]:
+    """Fig. 7: the post-process of earlier work on the motions as they came, and the bulges it leaves."""
+    faces, body_faces = tryon.garment.faces, tryon.model.body.faces
+
+    def one(frames: DressedFrames) -> np.ndarray:
+        harms, after = [], []
+        for garment, body in zip(frames.garment, frames.bodies, strict=True):
+            after.append(push_out(garment, body, body_faces))
+            harm = bulge(garment, after[-1], faces)
+            moved = float(harm.moved.float().mean())
+            harms.append([1.0, moved, moved * harm.shift, moved * harm.detail_lost, moved * harm.stretched])
+        left = penetration(frames.bodies, body_faces, torch.stack(after)).share
+        return np.array([*np.sum(harms, axis=0), len(after) * left])
+
+    frames, moved, *harm, left = np.sum(dressed_each(tryon, worn, 4 * config.every, one), axis=0)
+    shift, lost, stretched = (amount / moved if moved else 0.0 for amount in harm)
+    return [
+        told(f"{label}: pushed out afterwards, raw motion: vertices it moves", PERCENT * moved / frames, "%"),
+        told(f"{label}: the same: their way, mean", MILLI * shift, "mm"),
+        told(f"{label}: the same: folds around them lost (Laplacian)", PERCENT * lost, "%"),
+        told(f"{label}: the same: edges around them stretched by over a tenth", PERCENT * stretched, "%"),
+        told(f"{label}: the same: vertices inside that remain", PERCENT * left / frames, "%"),
+    ]
+
+
+def far_shape_rows(label: str, tryon: TryOn, motions: Sequence[Motion], config: CollisionEvaluation) -> list[Row]:
+    """Fig. 6: shapes far beyond training; every component random, the largest one `far`, four motions."""
+    table, body = [], tryon.model.body
+    for far in FAR_SHAPES:
+        generator = torch.Generator().manual_seed(config.seed + 1)
+        drawn = torch.rand(4, body.shape_count, generator=generator) * 2 - 1
+        shapes = far * drawn / drawn.abs().amax(dim=1, keepdim=True)
+        chosen = [motion if abs(motion.fps - 30) < 1e-3 else motion.resampled(30.0) for motion in motions[::6]]
+        worn = _cleared(list(zip(chosen, shapes, strict=False)), body)
+        share = PERCENT * count(tryon, worn, 2 * config.every).inside
+        table.append(told(f"{label}: vertices inside, largest shape component {far:g} sd", share, "%"))
+    return table
 
 
 @torch.no_grad()
@@ -202,10 +311,10 @@ def fidelity_rows(label: str, tryon: TryOn) -> list[Row]:
 def _compared(tryon: TryOn, s: SimulatedSequence, index: Tensor, laplacian: Float[Tensor, "N N"]) -> np.ndarray:
     """Means over frames: 1, error, error of the template, gap, simulation's gap, folds, simulation's folds."""
     model = tryon.model
-    latent = tryon.regressor(s.rotations[None], s.translation[None], s.betas[None])[0][index]
+    X = tryon.canonical(Motion(s.rotations, s.translation, s.fps, model.body.skeleton, s.motion_name), s.betas)[index]
     state = model.state(s.rotations[index], s.betas, s.translation[index])
     bodies = model.body.vertices(s.rotations[index], s.betas, s.translation[index])
-    found = model.posed(tryon.subspace.decode(latent), state)
+    found = model.posed(X, state)
     wanted = s.garment[index]
     template = model.posed(tryon.garment.vertices.expand(len(index), -1, -1).contiguous(), state)
     return np.array(

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.collisions.diffused_body import Rigging
+from workbench.collisions.diffused_body import FieldValues, LinearFields, Rigging
 from workbench.collisions.garment_model import BodyState, LocalMap
+from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
 
 
@@ -63,3 +64,33 @@ def nearest_weights(
             for frame, (target, posed) in enumerate(zip(garment, posed_bodies, strict=True))
         ]
     )
+
+
+class ConstantFields(LinearFields):
+    """What earlier work gives each garment vertex, wherever it goes: the rigging of its body vertex in the template.
+
+    With it `GarmentModel` poses garments of the constant-weight unposed space (Tab. 1, the 2019-style row).
+    """
+
+    def __init__(self, body: Body, rigging: SurfaceRigging):
+        self.pose_map = body.pose_map
+        self.rows = FieldValues(
+            rigging.weights, rigging.shape_directions.transpose(0, 1), rigging.pose_directions.transpose(0, 1)
+        )
+
+    def at(self, points: Float[Tensor, "*B N 3"]) -> FieldValues:
+        """Errors: ValueError for another number of vertices than the template's."""
+        rows = self.rows
+        if points.shape[-2] != len(rows.weights):
+            raise ValueError(f"{points.shape[-2]} points, but the rigging of {len(rows.weights)} template vertices")
+        batch = points.shape[:-2]
+        return FieldValues(
+            rows.weights.expand(*batch, *rows.weights.shape),
+            rows.shape_directions.expand(*batch, *rows.shape_directions.shape),
+            rows.pose_directions.expand(*batch, *rows.pose_directions.shape),
+        )
+
+
+def constant_fields(body: Body, garment: Garment) -> ConstantFields:
+    """The constant rigging of a garment."""
+    return ConstantFields(body, nearest_rigging(body, garment.vertices, body.template))

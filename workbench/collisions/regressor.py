@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from workbench.body.model import Body
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
 from workbench.collisions.diffused_body import GridFields
-from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.motion_descriptor import (
     DESCRIPTOR_SIZE,
     POSE_SIZE,
@@ -25,7 +24,6 @@ from workbench.collisions.motion_descriptor import (
     descriptor,
     global_motion,
 )
-from workbench.collisions.posed_collision import PosedCollision
 from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace
 from workbench.garments import Garment
 from workbench.learning.fit import FitConfig, FitResult, fit
@@ -36,20 +34,14 @@ log = logging.getLogger(__name__)
 
 HIDDEN, LAYERS = 500, 2  # facts.md 1
 FORMAT = "regressor-1"
-SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
 
 
 @dataclass(frozen=True)
 class RegressorWeights:
-    """Eq. 18 and the term in posed space.  The paper leaves rho_1 and rho_2 open: ours, not tuned."""
+    """Eq. 18.  The paper leaves rho_1 and rho_2 open: ours, not tuned."""
 
     velocity: float = 1.0  # rho_1, a frame
     acceleration: float = 0.5  # rho_2, a frame squared
-    posed: float = 0.0  # mean hinge in posed space, millimetres (beyond the paper)
-    # Of the posed term: how near a random shape's latents stay to the true shape's.  Canonical error on validation:
-    # 20 mm without the posed term, 33 mm with it alone (1,000 steps), 27 mm with the anchor.
-    anchor: float = 1.0
-    clearance: float = 2e-3  # metres, of the posed term
 
 
 @dataclass(frozen=True)
@@ -61,15 +53,11 @@ class TrainRegressorConfig:
     data: Path | None = None
     # The folder with GARMENT-subspace.safetensors, also written to.
     out: Path = Path("out/models")
-    # Goes into the file names, for variants such as ".paper" (Tab. 1) beside the full model.
+    # Goes into the file names of subspace and regressor, for variants such as ".plain" (Tab. 1) beside the full model.
     suffix: str = ""
-    # A trained regressor to start from; its descriptor is kept.
-    start: Path | None = None
-    weights: RegressorWeights = RegressorWeights(posed=3.0)
+    weights: RegressorWeights = RegressorWeights()
     window: int = 40  # frames
     batch: int = 16  # windows a step
-    posed_every: int = 2  # steps between two with the posed term
-    posed_frames: int = 8  # frames a step that are posed, each from a random motion on a random shape
     describe: FitConfig = field(default_factory=lambda: FitConfig(steps=1500, learning_rate=2e-3))
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=2500, learning_rate=1e-3))
     watch_every: int = 500
@@ -200,7 +188,7 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class RegressorTraining:
-    """One run: data with its latents, the regressor, the posed term."""
+    """One run: data with its latents, the regressor."""
 
     config: TrainRegressorConfig
     body: Body
@@ -208,12 +196,11 @@ class RegressorTraining:
     subspace: Subspace
     latents: dict[str, list[Float[Tensor, "T L"]]]  # of every sequence of a split
     regressor: Regressor
-    posed: PosedCollision
 
     @staticmethod
     def of(config: TrainRegressorConfig) -> "RegressorTraining":
         data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
-        subspace = Subspace.load(config.out / f"{data.garment_name}-subspace.safetensors")
+        subspace = Subspace.load(config.out / f"{data.garment_name}{config.suffix}-subspace.safetensors")
         for parameter in subspace.parameters():
             parameter.requires_grad_(False)
         body = Body.default()
@@ -229,8 +216,7 @@ class RegressorTraining:
             data.fps,
             torch.Generator().manual_seed(config.seed),
         )
-        posed = PosedCollision(GarmentModel(body, GridFields.default()), clearance=config.weights.clearance)
-        return RegressorTraining(config, body, data, subspace, latents, regressor, posed)
+        return RegressorTraining(config, body, data, subspace, latents, regressor)
 
     def windows(self, split: str, count: int, length: int, generator: torch.Generator) -> Windows:
         """`count` random windows of `length` frames (shorter sequences are repeated at their end, not kept there)."""
@@ -245,32 +231,12 @@ class RegressorTraining:
             parts.append((s.rotations[index], s.translation[index], s.betas, latents[i][index], kept))
         return Windows(*(torch.stack(column) for column in zip(*parts, strict=True)))
 
-    def supervised(self, generator: torch.Generator) -> Float[Tensor, ""]:
-        """L_R of Eq. 18."""
+    def step(self, _: int, generator: torch.Generator) -> Float[Tensor, ""]:
+        """L_R of Eq. 18, on random windows."""
         w, batch = self.config.weights, self.windows("train", self.config.batch, self.config.window, generator)
         found = self.regressor(batch.rotations, batch.translation, batch.betas)
         given = (found, batch.latents, batch.kept)
         return position_loss(*given) + w.velocity * velocity_loss(*given) + w.acceleration * acceleration_loss(*given)
-
-    def unsupervised(self, generator: torch.Generator) -> Float[Tensor, ""]:
-        """The posed term: random training motions on random shapes; one frame of each; and the anchor."""
-        count, length = self.config.posed_frames, self.config.window // 2
-        batch = self.windows("train", count, length, generator)
-        betas = torch.randn(batch.betas.shape, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT)
-        found = self.regressor(batch.rotations, batch.translation, betas)
-        with torch.no_grad():
-            own = self.regressor(batch.rotations, batch.translation, batch.betas)
-        frame = torch.randint(length // 2, length, (count,), generator=generator)
-        pick = torch.arange(count)
-        X = self.subspace.decode(found[pick, frame])
-        w = self.config.weights
-        return w.posed * self.posed(X, batch.rotations[pick, frame], betas) + w.anchor * (found - own).abs().mean()
-
-    def step(self, step: int, generator: torch.Generator) -> Float[Tensor, ""]:
-        loss = self.supervised(generator)
-        if self.config.weights.posed and step % self.config.posed_every == 0:
-            loss = loss + self.unsupervised(generator)
-        return loss
 
 
 def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
@@ -279,8 +245,7 @@ def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
     generator = torch.Generator().manual_seed(config.seed + 3)
     template = Garment.load(training.data.garment_name).vertices
     chosen = torch.randperm(len(template), generator=generator)[:200]
-    model = training.posed.model
-    values = model.fields.at(template[chosen])
+    values = GridFields.default().at(template[chosen])
     rotations = torch.cat([s.rotations for s in training.data.of_split("train")])
     reader = nn.Sequential(nn.Linear(POSE_SIZE, 256), nn.ReLU(), nn.Linear(256, 3 * (len(chosen) + len(body.parents))))
     for layer in (reader[0], reader[2]):
@@ -318,11 +283,8 @@ def run(config: TrainRegressorConfig) -> Regressor:
     name = f"{training.data.garment_name}{config.suffix}"
     work = config.out / "work" / f"{name}-regressor"
     regressor = training.regressor
-    if config.start is not None:
-        regressor.load_state_dict(Regressor.load(config.start).state_dict())
-    else:
-        fit_descriptor(training, work)
-        regressor.standardise(training.data.of_split("train"))
+    fit_descriptor(training, work)
+    regressor.standardise(training.data.of_split("train"))
     train(training, work)
     regressor.eval()
     regressor.story = {
@@ -336,7 +298,7 @@ def run(config: TrainRegressorConfig) -> Regressor:
 
 
 def train(training: RegressorTraining, work: Path) -> FitResult:
-    """Eq. 18, and the posed term, with a point of the curves every `watch_every` steps."""
+    """Eq. 18, with a point of the curves every `watch_every` steps."""
     config = training.config
     curves: list[ScalarLog] = []
 
@@ -359,8 +321,8 @@ def train(training: RegressorTraining, work: Path) -> FitResult:
 
 @torch.no_grad()
 def measure(training: RegressorTraining) -> dict[str, float]:
-    """On sequences that the training does not see: error of the latents and of X [mm], and the hinge in posed space."""
-    latent_error, error, hinge, frames = 0.0, 0.0, 0.0, 0
+    """On sequences that the training does not see: error of the latents and of X [mm]."""
+    latent_error, error, frames = 0.0, 0.0, 0
     for s, wanted in zip(training.data.of_split("validation"), training.latents["validation"], strict=True):
         found = training.regressor(s.rotations[None], s.translation[None], s.betas[None])[0]
         pick = torch.arange(0, len(s), 12)
@@ -371,10 +333,8 @@ def measure(training: RegressorTraining) -> dict[str, float]:
         truth = training.data.garments(s.coefficients[pick])
         latent_error += float((found[pick] - wanted[pick]).abs().mean()) * len(pick)
         error += 1e3 * float((X - truth).norm(dim=-1).mean()) * len(pick)
-        hinge += float(training.posed(X, s.rotations[pick], s.betas.expand(len(pick), -1))) * len(pick)
         frames += len(pick)
     return {
         "validation latent error": latent_error / frames,
         "validation error, mm": error / frames,
-        "validation posed hinge, mm": hinge / frames,
     }

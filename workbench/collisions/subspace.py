@@ -64,6 +64,8 @@ class TrainSubspaceConfig:
     # A set of canonical garments (.npz, `python -m assets_gen dataset`); the shipped one when absent.
     data: Path | None = None
     out: Path = Path("out/models")
+    # Goes into the file name, for variants such as ".plain" (Tab. 1) beside the full model.
+    suffix: str = ""
     network: NetworkConfig = NetworkConfig()
     weights: LossWeights = LossWeights()
     batch: int = 32  # training frames a step
@@ -353,14 +355,15 @@ class SubspaceTraining:
 def run(config: TrainSubspaceConfig) -> Subspace:
     """Train (or continue), write `out`/GARMENT-subspace.safetensors with its curves, return it."""
     training = SubspaceTraining.of(config)
-    work = config.out / "work" / f"{training.data.garment_name}-subspace"
+    name = f"{training.data.garment_name}{config.suffix}"
+    work = config.out / "work" / f"{name}-subspace"
     train(training, work)
     subspace = training.subspace.eval()
     subspace.story = {
         "config": _plain(config),
         "curves": read_curves(work / "curves.jsonl"),
     }
-    path = config.out / f"{training.data.garment_name}-subspace.safetensors"
+    path = config.out / f"{name}-subspace.safetensors"
     subspace.save(path)
     log.info("written: %s (%.1f MB)", path, path.stat().st_size / 1e6)
     return subspace

@@ -1,5 +1,7 @@
 """5-6: the runtime.  beta (10), motion -> x_bar (T,25) -> X (T,N,3) -> posed garment (T,N,3).
 
+X = D(x_bar), and where a corrective is trained X = D(x_bar) + C(theta, beta, x_bar) (`posed_corrective`).
+
 `TryOn.run` dresses a whole motion; `TryOn.stream` a frame at a time, with the same result.  The networks run in torch,
 or in onnxruntime (`tryon_onnx`); the fields come from the table or the paper's networks (`GarmentModel.fields`).
 """
@@ -21,8 +23,9 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.frame_posing import frame_poser
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.motion_descriptor import DescriptorStream
+from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
-from workbench.collisions.subspace import Subspace
+from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.formats import load_motion
 from workbench.garments import Garment
 from workbench.motion import Motion
@@ -101,14 +104,24 @@ class TryOn:
     subspace: Subspace
     garment: Garment
     networks: Networks
+    corrective: PosedCorrective | None = None  # beyond the paper
 
     @staticmethod
     def shipped(garment_name: str) -> "TryOn":
         """With the networks that ship for a garment, on the default body."""
-        return TryOn.of(Subspace.shipped(garment_name), Regressor.shipped(garment_name))
+        return TryOn.of(
+            Subspace.shipped(garment_name),
+            Regressor.shipped(garment_name),
+            corrective=PosedCorrective.beside(SHIPPED, garment_name),
+        )
 
     @staticmethod
-    def of(subspace: Subspace, regressor: Regressor, model: GarmentModel | None = None) -> "TryOn":
+    def of(
+        subspace: Subspace,
+        regressor: Regressor,
+        model: GarmentModel | None = None,
+        corrective: PosedCorrective | None = None,
+    ) -> "TryOn":
         """Raises ValueError when the networks belong to different garments, or the garment or body to neither."""
         model = model or GarmentModel(Body.default(), GridFields.default())
         if subspace.garment_name != regressor.garment_name:
@@ -125,7 +138,9 @@ class TryOn:
         joints = len(model.body.parents)
         if joints != regressor.joints:
             raise ValueError(f"the body has {joints} joints, but the regressor was trained for {regressor.joints}")
-        return TryOn(model, regressor, subspace, garment, TorchNetworks(regressor, subspace))
+        if corrective is not None:
+            _check_fit(corrective, subspace, regressor)
+        return TryOn(model, regressor, subspace, garment, TorchNetworks(regressor, subspace), corrective)
 
     def stream(self, betas: Float[Tensor, "K"]) -> "TryOnStream":
         """Frame by frame, for one shape."""
@@ -136,6 +151,21 @@ class TryOn:
         """x_bar of every frame      (Eq. 1)"""
         motion = self._at_rate(motion)
         return self.regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
+
+    def shaped(
+        self, latent: Float[Tensor, "*B L"], rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "K"]
+    ) -> Float[Tensor, "*B N 3"]:
+        """X of latents in poses: decoded, and corrected where there is a corrective."""
+        X = self.subspace.decode(latent)
+        if self.corrective is None:
+            return X
+        return X + self.corrective(rotations, betas.expand(*latent.shape[:-1], -1), latent)
+
+    @torch.no_grad()
+    def canonical(self, motion: Motion, betas: Float[Tensor, "K"], every: int = 1) -> Float[Tensor, "T N 3"]:
+        """X of one frame in `every` of a motion; the regressor sees all of them."""
+        motion = self._at_rate(motion)
+        return self.shaped(self.latents(motion, betas)[::every], motion.rotations[::every], betas)
 
     @torch.no_grad()
     def run(
@@ -153,7 +183,7 @@ class TryOn:
         bodies = latent.new_empty(frames, len(body.template), 3)
         for part in (slice(at, at + POSED_AT_ONCE) for at in range(0, frames, POSED_AT_ONCE)):
             rotations, translation = motion.rotations[part], motion.translation[part]
-            canonical[part] = self.subspace.decode(latent[part])
+            canonical[part] = self.shaped(latent[part], rotations, betas)
             state = self.model.state(rotations, betas, translation)
             garment[part] = self.model.posed(canonical[part], state)
             bodies[part] = body.vertices(rotations, betas, translation)
@@ -214,7 +244,24 @@ class TryOnStream:
         inputs = ((torch.cat([gamma, self.betas]) - regressor.centre) / regressor.size).clamp(-5, 5)
         latent, self.hidden = tryon.networks.regress(inputs, self.hidden)
         X = tryon.networks.decode(latent)
+        if tryon.corrective is not None:
+            X = X + tryon.corrective(rotations, self.betas, latent)
         return Frame(latent, X, self.pose(X, rotations, translation))
+
+
+def _check_fit(corrective: PosedCorrective, subspace: Subspace, regressor: Regressor) -> None:
+    """ValueError unless the three networks are of one garment and one body."""
+    if corrective.garment_name != subspace.garment_name or corrective.vertex_count != subspace.vertex_count:
+        raise ValueError(
+            f"the corrective is of garment {corrective.garment_name!r} with {corrective.vertex_count} vertices, "
+            f"but the subspace of {subspace.garment_name!r} with {subspace.vertex_count}; load what was trained "
+            "together"
+        )
+    if (corrective.joints, corrective.shapes) != (regressor.joints, regressor.shapes):
+        raise ValueError(
+            f"the corrective is for {corrective.joints} joints and {corrective.shapes} shape components, but the "
+            f"regressor for {regressor.joints} and {regressor.shapes}"
+        )
 
 
 def checked_shape(betas: Float[Tensor, "_"], body: Body) -> Float[Tensor, "K"]:
@@ -272,6 +319,7 @@ def load_tryon(garment: str, networks: Path | None) -> TryOn:
     return TryOn.of(
         Subspace.load(networks / f"{garment}-subspace.safetensors"),
         Regressor.load(networks / f"{garment}-regressor.safetensors"),
+        corrective=PosedCorrective.beside(networks, garment),
     )
 
 

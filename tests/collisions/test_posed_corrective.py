@@ -1,0 +1,138 @@
+"""Laws of the corrective against collisions in posed space, small and hardly trained."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from workbench.collisions.penetration import penetration
+from workbench.collisions.posed_corrective import (
+    CorrectiveTraining,
+    PosedCorrective,
+    TrainCorrectiveConfig,
+    WornPoses,
+    run,
+)
+from workbench.collisions.regressor import Regressor
+from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
+from workbench.collisions.tryon import TryOn, load_tryon
+from workbench.geometry.rotations import axis_angle_to_matrix
+from workbench.learning.fit import FitConfig
+from workbench.motion import Motion
+
+NETWORK = NetworkConfig(width=32, depth=2, rank=30)
+
+
+@pytest.fixture(scope="module")
+def config(small_set, body, tmp_path_factory) -> TrainCorrectiveConfig:
+    folder: Path = tmp_path_factory.mktemp("networks")
+    small_set.save(folder / "set.npz")
+    Subspace("tshirt", Statistics.of(small_set, NETWORK), NETWORK).save(folder / "tshirt-subspace.safetensors")
+    regressor = Regressor("tshirt", len(body.parents), body.shape_count, 30.0)
+    regressor.standardise(small_set.of_split("train"))
+    regressor.save(folder / "tshirt-regressor.safetensors")
+    return TrainCorrectiveConfig(
+        data=folder / "set.npz",
+        out=folder,
+        rank=8,
+        width=32,
+        shapes_a_motion=1,
+        every=6,
+        first_frames=8,
+        batch=2,
+        fit=FitConfig(steps=4, learning_rate=1e-2, warmup=1, checkpoint_every=2),
+        watch_every=2,
+    )
+
+
+def closed_arms(body, count: int) -> WornPoses:
+    """Arms pressed into the flanks: the template must end inside."""
+    rotations = body.rest_rotations()[None].repeat(count, 1, 1, 1)
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        rotations[:, body.joint_names.index(f"{side}Arm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.75 * sign, 0.0]))
+    return WornPoses(rotations, torch.zeros(count, body.shape_count), torch.zeros(count, 25))
+
+
+def test_it_begins_by_correcting_nothing_and_does_not_see_the_root(body):
+    basis = torch.randn(6, 3 * 50)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=16)
+    pose = axis_angle_to_matrix(0.3 * torch.randn(4, len(body.parents), 3))
+    given = (torch.randn(4, body.shape_count), torch.randn(4, 25))
+    assert not corrective(pose, *given).any()
+    torch.nn.init.normal_(corrective.layers[-1].weight)  # pyright: ignore[reportArgumentType]
+    turned = pose.clone()
+    turned[:, 0] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(corrective(turned, *given), corrective(pose, *given))
+    bent = pose.clone()
+    bent[:, 5] = turned[:, 0]
+    assert float((corrective(bent, *given) - corrective(pose, *given)).abs().max()) > 0
+
+
+def test_what_is_needed_brings_vertices_out(config, body):
+    """A garment that is too narrow, at rest: nothing folds there, so the way out is nearly exact."""
+    training = CorrectiveTraining.of(config)
+    training.subspace.decoder.middle.data *= torch.tensor([0.95, 0.95, 1.0]).repeat(training.subspace.vertex_count)
+    worn = WornPoses(body.rest_rotations()[None], torch.zeros(1, body.shape_count), torch.zeros(1, 25))
+    with torch.no_grad():
+        X = training.subspace.decode(worn.latents)
+    needed = training.needed(worn)
+    state, bodies = training.model.state(worn.rotations, worn.betas), body.vertices(worn.rotations, worn.betas)
+    local = training.model.local_map(X, state)
+    before, after = (penetration(bodies, body.faces, local.posed(shape)).share for shape in (X, X + needed))
+    assert before > 0.02
+    assert after < 0.1 * before
+    untouched = training.posed.distance(local.posed(X), bodies) >= training.posed.clearance
+    assert not needed[untouched].any()
+
+
+def test_learning_frees_vertices(config, body):
+    training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
+    basis = training.first_basis(worn)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=32)
+    optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
+    first = float(training.loss(corrective, worn).detach())
+    for _ in range(12):
+        optimizer.zero_grad()
+        loss = training.loss(corrective, worn)
+        loss.backward()
+        optimizer.step()
+    assert float(training.loss(corrective, worn).detach()) < 0.7 * first
+
+
+def test_training_writes_a_corrective_that_loads_continues_and_is_used(config, body, small_set):
+    first, again = run(config), run(config)
+    back = PosedCorrective.load(config.out / "tshirt-corrective.safetensors")
+    for name, tensor in first.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], tensor)
+        torch.testing.assert_close(back.state_dict()[name], tensor, atol=2e-2, rtol=2e-3)
+    assert [entry["step"] for entry in back.story["curves"]] == [2, 4]
+    tryon = load_tryon("tshirt", config.out)
+    assert tryon.corrective is not None
+    s = small_set.sequences[0]
+    motion, betas = Motion(s.rotations[:6], s.translation[:6], 30.0, body.skeleton), torch.zeros(10)
+    result, bare = tryon.run(motion, betas), replace(tryon, corrective=None).run(motion, betas)
+    offset = tryon.corrective(motion.rotations, betas.expand(6, -1), result.latent)
+    torch.testing.assert_close(result.canonical, bare.canonical + offset, atol=1e-6, rtol=1e-5)
+    stream = tryon.stream(betas)
+    for t in range(6):
+        frame = stream(motion.rotations[t], motion.translation[t])
+        torch.testing.assert_close(frame.canonical, result.canonical[t], atol=1e-4, rtol=1e-4)
+
+
+def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
+    with pytest.raises(FileNotFoundError, match="workbench train corrective"):
+        PosedCorrective.load(tmp_path / "none.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"no")
+    with pytest.raises(ValueError, match="is damaged"):
+        PosedCorrective.load(tmp_path / "bad.safetensors")
+    with pytest.raises(ValueError, match="is no corrective"):
+        PosedCorrective.load(config.out / "tshirt-regressor.safetensors")
+    other = PosedCorrective("dress", len(body.parents), body.shape_count, torch.zeros(2, 30))
+    networks = (
+        Subspace.load(config.out / "tshirt-subspace.safetensors"),
+        Regressor.load(config.out / "tshirt-regressor.safetensors"),
+    )
+    with pytest.raises(ValueError, match="trained together"):
+        TryOn.of(*networks, corrective=other)
+    assert PosedCorrective.beside(tmp_path, "tshirt") is None

@@ -1,0 +1,358 @@
+"""Beyond the paper: what the pose does to X so that Eq. 7 does not fold it into the body.  theta, beta, x_bar -> (N,3).
+
+Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
+touches nothing ends inside the posed body (facts.md 9).  25 latents cannot say where: pushing the regressor's own
+output (tried before) took a third of the collisions off and cost 2.4 mm of vertex error.  This network adds an offset
+C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `PosedCollision` alone, on training motions worn by
+random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on
+C and on its Laplacian keeps it away from where it is not needed.
+"""
+
+import json
+import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from workbench.body.model import Body
+from workbench.collisions.body_sdf import BodySDF, GridSDF
+from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.posed_collision import PosedCollision
+from workbench.collisions.regressor import Regressor
+from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace, collision_loss
+from workbench.garments import Garment
+from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.learning.fit import FitConfig, fit
+from workbench.learning.network_file import read_network, write_network
+from workbench.learning.scalar_log import ScalarLog, read_curves
+from workbench.motion import Motion
+from workbench.store import atomic_write
+
+log = logging.getLogger(__name__)
+
+FORMAT = "corrective-1"
+MILLI = 1e3
+SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
+FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
+FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
+
+
+@dataclass(frozen=True)
+class CorrectiveWeights:
+    """Terms in millimetres (`size`: square millimetres); ours.  Compared on validation motions only."""
+
+    hinge: float = 50.0  # of the depth in posed space
+    canonical: float = 50.0  # of Eq. 16's hinge on X + C
+    # |C|^2: square, so that no vertex goes far.  On validation motions 0.547 % are inside without C, error 19.1 mm;
+    # after 600 steps 0.05 left 0.381 % and 18.8 mm, 0.012 0.179 % and 19.0 mm; |C|_1 x 0.15 left 0.055 % and 23.5 mm.
+    size: float = 0.008
+    laplacian: float = 0.5  # |Delta C|_1
+    posed_clearance: float = 3e-3  # metres
+    canonical_clearance: float = 2e-3  # metres, epsilon of Eq. 16
+
+
+@dataclass(frozen=True)
+class TrainCorrectiveConfig:
+    """`workbench train corrective`: after subspace and regressor, from the training set's motions alone."""
+
+    garment: str = "tshirt"
+    # A set of canonical garments (.npz), for its motions; the shipped one when absent.
+    data: Path | None = None
+    # The folder with GARMENT-subspace and GARMENT-regressor, also written to.
+    out: Path = Path("out/models")
+    rank: int = 64
+    width: int = 512
+    weights: CorrectiveWeights = CorrectiveWeights()
+    shapes_a_motion: int = 2  # random shapes that wear each training motion
+    every: int = 3  # frames of it: one in so many is learned from
+    first_frames: int = 240  # whose needed corrections give the first basis
+    batch: int = 8  # frames a step
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=2000, learning_rate=2e-3, clip_norm=50.0))
+    watch_every: int = 400
+    seed: int = 0
+
+
+class PosedCorrective(nn.Module):
+    """C(theta, beta, x_bar): two dense layers, ReLU and LayerNorm each, then amounts of a learned basis."""
+
+    def __init__(
+        self,
+        garment_name: str,
+        joints: int,
+        shapes: int,
+        basis: Float[Tensor, "R N3"],
+        width: int = 512,
+        generator: torch.Generator | None = None,
+    ):
+        """basis: amounts -> flattened offsets, millimetres."""
+        super().__init__()
+        generator = generator or torch.Generator().manual_seed(0)
+        self.garment_name, self.joints, self.shapes = garment_name, joints, shapes
+        inputs = 9 * (joints - 1) + shapes + LATENTS
+        layers: list[nn.Module] = []
+        for size in (inputs, width):
+            dense = nn.Linear(size, width)
+            nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
+            nn.init.zeros_(dense.bias)
+            layers += [dense, nn.ReLU(), nn.LayerNorm(width, eps=1e-3)]
+        last = nn.Linear(width, len(basis))
+        nn.init.zeros_(last.weight)  # it begins by correcting nothing
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(*layers, last)
+        self.basis = nn.Parameter(basis.clone())
+        self.story: dict = {}
+
+    @property
+    def vertex_count(self) -> int:
+        return self.basis.shape[1] // 3
+
+    def forward(
+        self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
+    ) -> Float[Tensor, "*B N 3"]:
+        """The offset of X, metres, canonical space; the root's rotation does not matter."""
+        pose = (rotations[..., 1:, :, :] - torch.eye(3)).flatten(-3)
+        seen = torch.cat([pose, FEATURE_SCALE * betas, FEATURE_SCALE * latent], dim=-1)
+        return (self.layers(seen) @ self.basis).unflatten(-1, (-1, 3)) / MILLI
+
+    def save(self, path: Path) -> None:
+        """The parameters, with what made them."""
+        metadata = {
+            "format": FORMAT,
+            "garment": self.garment_name,
+            "joints": str(self.joints),
+            "shapes": str(self.shapes),
+            "story": json.dumps(self.story),
+        }
+        write_network(self, path, metadata)
+
+    @staticmethod
+    def load(path: str | Path) -> "PosedCorrective":
+        """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
+        found = read_network(Path(path), "train it with `workbench train corrective`")
+        metadata = found.metadata
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
+        basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
+        sizes = (int(metadata["joints"]), int(metadata["shapes"]))
+        corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), width)
+        corrective.load_state_dict(found.tensors)
+        corrective.story = json.loads(metadata["story"])
+        return corrective.eval()
+
+    @staticmethod
+    def beside(folder: Path, garment_name: str) -> "PosedCorrective | None":
+        """The corrective of a garment in a folder of networks, if there is one."""
+        path = folder / f"{garment_name}-corrective.safetensors"
+        return PosedCorrective.load(path) if path.is_file() else None
+
+    @staticmethod
+    def shipped(garment_name: str) -> "PosedCorrective | None":
+        """The corrective that ships for a garment, if one does."""
+        return PosedCorrective.beside(SHIPPED, garment_name)
+
+
+@dataclass(frozen=True, eq=False)
+class WornPoses:
+    """Poses of cleared motions, the shapes that wear them, and what the regressor says of them."""
+
+    rotations: Float[Tensor, "M J 3 3"]
+    betas: Float[Tensor, "M K"]
+    latents: Float[Tensor, "M L"]
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def __getitem__(self, index: Tensor) -> "WornPoses":
+        return WornPoses(self.rotations[index], self.betas[index], self.latents[index])
+
+    @staticmethod
+    def of(
+        sequences: Sequence[CanonicalSequence],
+        fps: float,
+        body: Body,
+        regressor: Regressor,
+        shapes_a_motion: int,
+        every: int,
+        generator: torch.Generator,
+    ) -> "WornPoses":
+        """Every motion on random shapes, cleared for each; minutes for a hundred motions."""
+        worn = [
+            (s, torch.randn(body.shape_count, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT))
+            for s in sequences
+            for _ in range(shapes_a_motion)
+        ]
+
+        @torch.no_grad()
+        def one(pair: tuple[CanonicalSequence, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+            s, betas = pair
+            motion = Motion(s.rotations, s.translation, fps, body.skeleton, s.motion_name).cleared(body, betas=betas)
+            latents = regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
+            index = torch.arange(0, len(motion), every)
+            return motion.rotations[index], betas.expand(len(index), -1), latents[index]
+
+        with ThreadPoolExecutor(2) as pool:
+            done = list(tqdm(pool.map(one, worn), total=len(worn), desc="clear for random shapes", mininterval=5.0))
+        return WornPoses(*(torch.cat(column) for column in zip(*done, strict=True)))
+
+    @staticmethod
+    def kept_at(path: Path, make: "CorrectiveTraining", split: str) -> "WornPoses":
+        """Read from `path` if an interrupted run left them there, else made and kept."""
+        if path.is_file():
+            with np.load(path) as file:
+                return WornPoses(*(torch.from_numpy(file[name]) for name in ("rotations", "betas", "latents")))
+        made = make.wear(split)
+        with atomic_write(path) as part:
+            np.savez(part, rotations=made.rotations.numpy(), betas=made.betas.numpy(), latents=made.latents.numpy())
+        return made
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectiveTraining:
+    """One run: data, the networks that are done, the loss."""
+
+    config: TrainCorrectiveConfig
+    data: CanonicalSet
+    subspace: Subspace
+    regressor: Regressor
+    model: GarmentModel
+    sdf: BodySDF
+
+    @staticmethod
+    def of(config: TrainCorrectiveConfig) -> "CorrectiveTraining":
+        data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
+        name = data.garment_name
+        subspace = Subspace.load(config.out / f"{name}-subspace.safetensors")
+        regressor = Regressor.load(config.out / f"{name}-regressor.safetensors")
+        model = GarmentModel(Body.default(), GridFields.default())
+        return CorrectiveTraining(config, data, subspace, regressor, model, GridSDF.default())
+
+    @cached_property
+    def posed(self) -> PosedCollision:
+        return PosedCollision(self.model, clearance=self.config.weights.posed_clearance)
+
+    @cached_property
+    def laplacian(self) -> Float[Tensor, "N N"]:
+        garment = Garment.load(self.data.garment_name)
+        return umbrella_laplacian(garment.faces, len(garment.vertices))
+
+    def wear(self, split: str) -> WornPoses:
+        """The motions of a split on random shapes."""
+        generator = torch.Generator().manual_seed(self.config.seed + {"train": 3, "validation": 5}[split])
+        return WornPoses.of(
+            self.data.of_split(split),
+            self.data.fps,
+            self.model.body,
+            self.regressor,
+            self.config.shapes_a_motion,
+            self.config.every,
+            generator,
+        )
+
+    def needed(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
+        """What would bring each vertex that is too near to the clearance: A^T (c - d) n, in canonical space."""
+        with torch.no_grad():
+            X = self.subspace.decode(worn.latents)
+            local = self.model.local_map(X, self.model.state(worn.rotations, worn.betas))
+            bodies = self.model.body.vertices(worn.rotations, worn.betas)
+        posed = local.posed(X).requires_grad_(True)
+        distance = self.posed.distance(posed, bodies)
+        (away,) = torch.autograd.grad(distance.sum(), posed)
+        short = (self.posed.clearance - distance.detach()).clamp_min(0.0)
+        return (local.rotation.mT @ (short[..., None] * away)[..., None])[..., 0]
+
+    def first_basis(self, worn: WornPoses) -> Float[Tensor, "R N3"]:
+        """Principal directions of the needed corrections of some frames, millimetres."""
+        generator = torch.Generator().manual_seed(self.config.seed + 1)
+        some = torch.randperm(len(worn), generator=generator)[: self.config.first_frames]
+        needed = torch.cat([self.needed(worn[part]).flatten(1) for part in some.split(16)])
+        _, size, directions = torch.linalg.svd(needed, full_matrices=False)
+        rank = min(self.config.rank, len(size))
+        return MILLI * FIRST_GAIN * directions[:rank] * (size[:rank, None] / len(needed) ** 0.5 + 1e-6)
+
+    def loss(self, corrective: PosedCorrective, worn: WornPoses) -> Float[Tensor, ""]:
+        """The four terms, of one batch."""
+        w = self.config.weights
+        with torch.no_grad():
+            X = self.subspace.decode(worn.latents)
+        offset = corrective(worn.rotations, worn.betas, worn.latents)
+        corrected = X + offset
+        hinge = self.posed(corrected, worn.rotations, worn.betas)
+        canonical = collision_loss(self.sdf, corrected, w.canonical_clearance)
+        size = MILLI**2 * offset.square().sum(-1).mean()
+        rough = MILLI * apply_laplacian(self.laplacian, offset).abs().mean()
+        return w.hinge * hinge + w.canonical * canonical + w.size * size + w.laplacian * rough
+
+    @torch.no_grad()
+    def measure(self, corrective: PosedCorrective, worn: WornPoses) -> dict[str, float]:
+        """On validation motions: the hinge in posed space before and after, vertices inside, the size of C [mm]."""
+        before, after, size = [], [], []
+        for part in torch.arange(0, len(worn), 6).split(16):
+            some = worn[part]
+            X = self.subspace.decode(some.latents)
+            offset = corrective(some.rotations, some.betas, some.latents)
+            bodies = self.model.body.vertices(some.rotations, some.betas)
+            state = self.model.state(some.rotations, some.betas)
+            for found, shape in ((before, X), (after, X + offset)):
+                found.append((self.posed.distance(self.model.posed(shape, state), bodies) < 0).float().mean(1))
+            size.append(MILLI * offset.norm(dim=-1).mean(1))
+        return {
+            "validation inside without, %": 100 * float(torch.cat(before).mean()),
+            "validation inside, %": 100 * float(torch.cat(after).mean()),
+            "validation size, mm": float(torch.cat(size).mean()),
+        }
+
+
+def run(config: TrainCorrectiveConfig) -> PosedCorrective:
+    """Train (or continue), write `out`/GARMENT-corrective.safetensors with its curves, return it."""
+    training = CorrectiveTraining.of(config)
+    name, body = training.data.garment_name, training.model.body
+    work = config.out / "work" / f"{name}-corrective"
+    worn = {split: WornPoses.kept_at(work / f"{split}.npz", training, split) for split in ("train", "validation")}
+    corrective = PosedCorrective(
+        name,
+        len(body.parents),
+        body.shape_count,
+        training.first_basis(worn["train"]),
+        config.width,
+        torch.Generator().manual_seed(config.seed),
+    )
+    curves: list[ScalarLog] = []
+
+    def loss_of(_: int, generator: torch.Generator) -> Float[Tensor, ""]:
+        index = torch.randint(len(worn["train"]), (config.batch,), generator=generator)
+        return training.loss(corrective, worn["train"][index])
+
+    def watch(step: int, loss: float) -> None:
+        if not curves:
+            curves.append(ScalarLog(work, begin=step + 1))
+        if (step + 1) % config.watch_every == 0 or step + 1 == config.fit.steps:
+            curves[0].add(step + 1, {"loss": loss, **training.measure(corrective, worn["validation"])})
+
+    fit(
+        list(corrective.parameters()),
+        loss_of,
+        config.fit,
+        generator=torch.Generator().manual_seed(config.seed + 2),
+        checkpoint=work / "checkpoint.safetensors",
+        label=f"corrective of {name}",
+        watch=watch,
+    )
+    corrective.eval()
+    corrective.story = {
+        "config": json.loads(json.dumps(asdict(config), default=str)),
+        "curves": read_curves(work / "curves.jsonl"),
+    }
+    path = config.out / f"{name}-corrective.safetensors"
+    corrective.save(path)
+    log.info("written: %s (%.1f MB)", path, path.stat().st_size / 1e6)
+    return corrective
