@@ -211,14 +211,18 @@ def compact(scans: ScanSequence) -> ScanSequence:
 
 def _ship(config: OutfitsConfig, scans: Sequence[ScanSequence]) -> None:
     for sequence in scans:
-        small = compact(sequence)
+        small, stride = compact(sequence), round(config.record.cloth.fps / sequence.fps)
         target = ASSETS / "scans" / split_of(sequence) / f"{sequence.outfit}-{sequence.motion}.npz"
         small.save(target)
+        if sequence.outfit in DRAPED:
+            source, made = "--sequences out/dataset", {}
+        else:
+            source, made = f"--frames {config.frames}", {"record": describe(config.record)}
         add_to_manifest(
             ASSETS / "manifest.json",
             target,
-            command="python -m assets_gen outfits --sequences out/dataset --ship",
-            config={"frames": config.frames, "stride": config.stride, "record": describe(config.record)},
+            command=f"python -m assets_gen outfits {source} --stride {stride} --ship",
+            config={"stride": stride, **made},
             licence="Apache-2.0",
             code=code_version("assets_gen.scans", "assets_gen.simulations", "assets_gen.cloth_solver"),
             scores={"scans": len(small), "points": small.ticks.shape[1]},
