@@ -201,7 +201,7 @@ def dressed_frames(tryon: TryOn, motion: Motion, betas: Float[Tensor, "K"], ever
         translation=motion.translation[::every],
         fps=motion.fps / every,
     )
-    canonical = tryon.subspace.decode(latent)
+    canonical = tryon.shaped(latent, thin.rotations, betas)
     pose = frame_poser(tryon.model, betas, canonical.shape[1])
     frames = zip(canonical, thin.rotations, thin.translation, strict=True)
     return TryOnResult(
