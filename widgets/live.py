@@ -77,13 +77,7 @@ class LiveScene(anywidget.AnyWidget):
         if message.get("kind") != "draw":
             return
         try:
-            camera = Camera(
-                position=tuple(message["camera"]["position"]),
-                target=tuple(message["camera"]["target"]),
-                up=tuple(message["camera"]["up"]),
-                view_angle=message["camera"]["angle"],
-            )
-            looked_at = replace(self._shown, camera=camera)
+            looked_at = replace(self._shown, camera=_camera(message["camera"]))
             pixels = picture(looked_at, (self.size[0], self.size[1]), int(message["frame"]), oversampling=1)
             self.send({"kind": "picture"}, [encoded(pixels, "JPEG")])
         except CannotDraw as reason:
@@ -91,6 +85,17 @@ class LiveScene(anywidget.AnyWidget):
         except Exception as reason:  # Jupyter would hide it in a log, and the view would wait for ever
             self.tell(f"The kernel could not draw this: {reason}")
             raise
+
+
+def _camera(told: dict[str, Any]) -> Camera:
+    """The browser's camera; JavaScript does not tell 3.0 from 3."""
+    position, target, up = ([float(x) for x in told[name]] for name in ("position", "target", "up"))
+    return Camera(
+        (position[0], position[1], position[2]),
+        (target[0], target[1], target[2]),
+        (up[0], up[1], up[2]),
+        float(told["angle"]),
+    )
 
 
 def _encoded(scene: Scene, size: tuple[int, int]) -> Wire:

@@ -1,11 +1,10 @@
 """The inspector's page in a real browser: a click on a cell shows its frame, its region, its worst vertex; offline."""
 
 import json
-import shutil
 
 import pytest
 import torch
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import expect
 
 from workbench.collisions.planting import Plant, planted
 from workbench.collisions.sequences import shipped_sequence
@@ -14,7 +13,6 @@ from workbench.geometry.mesh import unique_edges
 from workbench.inspector import InspectConfig, run
 
 pytestmark = pytest.mark.browser
-SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
 
 
 @pytest.fixture(scope="module")
@@ -37,29 +35,17 @@ def report(body, tmp_path_factory):
 
 
 @pytest.fixture
-def page(report):
-    chromium = shutil.which("chromium")
-    if chromium is None:  # .ci/run installs it, so there the tests run
-        pytest.skip("no Chromium on this machine: apt-get install chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))
-        page = browser.new_page(viewport={"width": 1400, "height": 900})
-        troubles: list[str] = []
-        page.on("console", lambda said: troubles.append(said.text) if said.type == "error" else None)
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        page.on("request", lambda asked: troubles.append(asked.url) if asked.url.startswith("http") else None)
-        page.goto((report / "report.html").as_uri())
-        page.wait_for_function("window.workbenchView", timeout=60_000)
-        yield page
-        assert troubles == []
-        browser.close()
+def page(report, open_file):
+    page = open_file(report / "report.html")
+    page.wait_for_function("window.workbenchView", timeout=60_000)
+    return page
 
 
 def test_a_cell_shows_its_frame_region_and_depth(page, report):
     figures = json.loads((report / "report.json").read_text())
     before = page.evaluate("workbenchView.png()")
     page.click('#heat .cell[data-f="4"]')
-    page.wait_for_timeout(500)
+    expect(page.locator("body")).to_have_attribute("data-frame", "4")
     assert page.evaluate("workbenchView.frame()") == 4
     told = page.inner_text("#told")
     assert told.startswith("belly, frame 4 (0.13 s): ")
@@ -75,7 +61,7 @@ def test_a_cell_shows_its_frame_region_and_depth(page, report):
 def test_an_incident_is_picked(page, report):
     incident = json.loads((report / "report.json").read_text())["incidents"][0]
     page.click("#charts tr.go")
-    page.wait_for_timeout(500)
+    expect(page.locator(".wbv-read")).to_be_visible()
     read = page.inner_text(".wbv-read")
     assert "garment, vertex 3796" in read
     assert f"{incident['depth_mm']:.2f} mm" in read
