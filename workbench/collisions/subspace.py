@@ -239,7 +239,7 @@ class Subspace(nn.Module):
             "network": json.dumps(asdict(self.config)),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata)
+        write_network(self, path, metadata, coarse=("encoder.view",))
 
     @staticmethod
     def load(path: str | Path) -> "Subspace":
