@@ -1,4 +1,4 @@
-"""The points models that ship: training scans -> POP of all outfits, patches of each, test scans, manifest."""
+"""The points models that ship: training scans -> POP of all outfits, patches of each, manifest."""
 
 import json
 import shutil
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from workbench.body.model import Body
-from workbench.points.scans import ScanSequence, load_scans
+from workbench.points.scans import load_scans
 from workbench.points.trained_points import TrainedPatches, TrainedPoints
 from workbench.points.training_run import TrainPointsConfig, training_folder
 from workbench.points.training_run import run as train
@@ -29,39 +29,25 @@ COMMAND = "python -m assets_gen points"
 
 @dataclass(frozen=True)
 class PointModelsConfig:
-    """Train what dresses bodies in points, POP and the patches it is compared with; record it with the test scans."""
+    """Train what dresses bodies in points, POP and the patches it is compared with."""
 
-    # Scans in train/ and test/ (`python -m assets_gen scans`).
+    # Scans in train/ and test/ (`python -m assets_gen outfits`).
     data: Path = Path("out/scans")
     out: Path = Path("workbench/assets/points")
-    # Where the shipped scans go: some test scans, thinned.
-    scans: Path = Path("workbench/assets/scans")
     # Where training keeps its state.
     work: Path = Path("out/points")
-    # Test scans that ship, of each sequence.
-    frames: int = 3
     pop: TrainPointsConfig = TrainPointsConfig()
     patches: TrainPointsConfig = TrainPointsConfig(method="patches")
 
 
 def run(config: PointModelsConfig) -> None:
-    """Write pop.safetensors, patches-OUTFIT.safetensors, the test scans and their manifest entries."""
+    """Write pop.safetensors, patches-OUTFIT.safetensors, the list of what they learned from, and the manifest."""
     body = Body.default()
     for training in (config.pop, config.patches):
         for path in train(replace(training, data=config.data, out=config.work)):
             kind = TrainedPatches if training.method == "patches" else TrainedPoints
             _ship(path, config.out / path.name, dict(kind.load(path, body).story))
-    for scan in load_scans(config.data / "test"):
-        few = thinned(scan, config.frames)
-        target = config.scans / "test" / f"{scan.outfit}-{scan.motion}.npz"
-        few.save(target)
-        _record(target, {"frames": len(few), "of": len(scan)}, {})
     _record_training_set(config)
-
-
-def thinned(scan: ScanSequence, frames: int) -> ScanSequence:
-    """So many scans of a sequence, evenly spread."""
-    return scan.every(max(1, -(-len(scan) // frames)))
 
 
 def _record_training_set(config: PointModelsConfig) -> None:
@@ -83,7 +69,7 @@ def _ship(source: Path, target: Path, story: dict[str, Any]) -> None:
 
 def _record(target: Path, made_by: dict[str, Any], scores: dict[str, float]) -> None:
     add_to_manifest(
-        target.parents[1 if target.parent.name != "test" else 2] / "manifest.json",
+        target.parents[1] / "manifest.json",
         target,
         command=COMMAND,
         config=made_by,

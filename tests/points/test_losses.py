@@ -1,9 +1,11 @@
 """Eq. 3-6: each term against its formula, and their sum."""
 
+import pytest
 import torch
 
 from workbench.geometry.chamfer import match
 from workbench.points.losses import (
+    LOOSE,
     LossTerms,
     LossWeights,
     displacement_loss,
@@ -49,3 +51,20 @@ def test_gradients_of_normals(rng):
     found = match(x.float(), torch.from_numpy(rng.normal(size=(15, 3))).float())
     n_x = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(10, 3))), dim=-1).requires_grad_()
     assert torch.autograd.gradcheck(lambda n: normal_loss(n, n_y, found), (n_x,))
+
+
+def test_how_far_short_of_the_cloth_a_point_settles():
+    """One point, one scan point 10 cm off the body: 9 % short with the published weight, 1 % with ours."""
+
+    def settled(weights):
+        r = torch.zeros(1, 3, requires_grad=True)
+        y = torch.tensor([[0.1, 0.0, 0.0]])
+        for _ in range(60):
+            matches = match(r, y)
+            terms = LossTerms(distance_loss(r, y, matches), torch.zeros(()), displacement_loss(r), torch.zeros(()))
+            (gradient,) = torch.autograd.grad(terms.total(weights), r)
+            r = (r - 1e-5 * gradient).detach().requires_grad_()
+        return float(r.detach()[0, 0])
+
+    assert settled(LossWeights()) == pytest.approx(0.1 / 1.1, rel=1e-3)
+    assert settled(LOOSE) == pytest.approx(0.1 / 1.01, rel=1e-3)

@@ -20,6 +20,7 @@ from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.npz import read_npz
 from workbench.points.clothed_points import PointModel, clothed
 from workbench.points.losses import (
+    LOOSE,
     LossTerms,
     LossWeights,
     displacement_loss,
@@ -49,7 +50,7 @@ class ScanFitConfig:
     fit: FitConfig = FitConfig(
         steps=200, learning_rate=4e-3, last_rate=2e-4, warmup=5, clip_norm=1e9, checkpoint_every=10**9
     )  # ours: facts.md 2 has 401 steps of 5e-4; larger and falling rates reach the same loss sooner
-    weights: LossWeights = LossWeights()
+    weights: LossWeights = LOOSE
     queries: int = 6000  # pixels a step
     scan_points: int = 12000  # of the scan a step
     precision: Precision = "float32"

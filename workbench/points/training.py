@@ -21,6 +21,7 @@ from workbench.geometry.chamfer import match
 from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.points.clothed_points import ClothedPoints
 from workbench.points.losses import (
+    LOOSE,
     LossTerms,
     LossWeights,
     displacement_loss,
@@ -68,7 +69,7 @@ class PointTrainingConfig:
     fit: FitConfig = FitConfig(
         steps=6000, learning_rate=2e-3, last_rate=2e-5, warmup=100, clip_norm=100.0, checkpoint_every=200
     )
-    weights: LossWeights = LossWeights()
+    weights: LossWeights = LOOSE
     batch: int = 2  # frames a step; ours: more steps of fewer frames go further in the same time (published: 4)
     queries: int = 2048  # pixels a frame; at most all that show the body
     scan_points: int = 6144  # of each scan
@@ -86,6 +87,7 @@ def papers_training(frames: int) -> PointTrainingConfig:
     rate = FitConfig(steps=steps, learning_rate=3e-4, last_rate=3e-4, warmup=1, clip_norm=1e9, checkpoint_every=500)
     return PointTrainingConfig(
         fit=rate,
+        weights=LossWeights(),
         batch=4,
         queries=QUERY_SIZE**2,
         scan_points=40_000,
