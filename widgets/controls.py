@@ -12,8 +12,9 @@ from typing import Any
 
 from workbench.extras import require
 
-LABEL, SLIDER = "110px", "290px"  # widths in a column of controls
+LABEL, SLIDER = "90px", "300px"  # widths in a column of controls
 NARROW = "250px"
+KEPT = {"flex": "0 0 auto"}  # a column that scrolls would else squeeze its rows flat
 
 Real = int | float
 
@@ -238,12 +239,12 @@ def column(groups: Sequence[Group]) -> Any:
         buttons = [item.twin() for item in group.items if isinstance(item, Button)]
         rows = [item.twin() for item in group.items if isinstance(item, Control)]
         if buttons:
-            rows.insert(0, widgets.HBox(buttons, layout={"flex_flow": "row wrap"}))
-        inside = widgets.VBox(rows)
+            rows.insert(0, widgets.HBox(buttons, layout=KEPT | {"flex_flow": "row wrap"}))
+        inside = widgets.VBox(rows, layout=KEPT)
         if group.folded:
-            parts.append(widgets.Accordion([inside], titles=(group.title,), selected_index=None))
+            parts.append(widgets.Accordion([inside], titles=(group.title,), selected_index=None, layout=KEPT))
         else:
-            parts.append(widgets.VBox([widgets.HTML(f"<b>{group.title}</b>"), inside]))
+            parts.append(widgets.VBox([widgets.HTML(f"<b>{group.title}</b>"), inside], layout=KEPT))
     return widgets.VBox(parts, layout={"width": "330px", "flex": "0 0 auto", "max_height": "640px", "overflow": "auto"})
 
 
@@ -292,8 +293,10 @@ def seed_slider(value: int = 0, most: int = 99) -> Number:
 
 def _slider(name: str, value: Real, low: Real, high: Real, step: Real, told: str) -> Any:
     widgets = require("ipywidgets", "lab")
-    kind = widgets.IntSlider if isinstance(step, int) else widgets.FloatSlider
+    whole = isinstance(step, int)
+    kind, digits = (widgets.IntSlider, "d") if whole else (widgets.FloatSlider, ".0f" if step >= 1 else ".2f")
     return kind(
+        readout_format=digits,
         value=value,
         min=low,
         max=high,

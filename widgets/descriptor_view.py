@@ -18,7 +18,7 @@ from workbench.collisions.regressor import Regressor
 from workbench.motion import Motion
 
 FRAMES = 90  # shown at most
-SIZE = (620, 560)
+SIZE = (620, 440)
 P = POSE_SIZE
 POSE_NAMES = tuple(f"{index + 1}" for index in range(P))
 ROOT_NAMES, TURN_NAMES = ("aside", "back (the body faces -y)", "up"), ("heading", "about x", "about y")

@@ -11,7 +11,7 @@ from widgets.plot import CURSOR, FigurePanel, drawn
 from workbench.collisions.inspection import Inspection
 from workbench.inspector import InspectionResult
 
-SIZE = (640, 560)
+SIZE = (640, 460)
 MAP_SIZE = (900, 420)
 
 

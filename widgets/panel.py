@@ -116,7 +116,7 @@ class Panel:
 
     def picture(self, size: tuple[int, int] | None = None, oversampling: int = 2) -> Pixels:
         """What is seen now, drawn without a browser.  Raises CannotDraw on a machine without GL."""
-        width, height = size or self.size
+        width, height = size or self._whole()
         if self.plot is None:
             return picture(fitted(self.scene, self.size, (width, height)), (width, height), self.frame, oversampling)
         aside = round(width * PLOT_SHARE)
@@ -141,7 +141,7 @@ class Panel:
             self._image = widgets.Image(format="png", value=self._plotted())
             live.observe(lambda _: self._redraw(), "frame")
             seen.insert(1, self._image)
-        right = widgets.VBox(seen)
+        right = widgets.VBox(seen, layout={"width": f"{self.size[0]}px", "flex": "0 1 auto"})
         return widgets.HBox([column(self.groups), right] if self.groups else [right])
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
@@ -157,6 +157,11 @@ class Panel:
             faults.append(str(reason))
         bundle["text/plain"] = "; ".join([part for part in (self.title, self.readout, *faults) if part])
         return bundle
+
+    def _whole(self) -> tuple[int, int]:
+        """Pixels of the scene with its plot beside it."""
+        width, height = self.size
+        return (width if self.plot is None else round(width / (1 - PLOT_SHARE)), height)
 
     # following
 

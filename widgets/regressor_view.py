@@ -23,7 +23,7 @@ from workbench.tryon_demo import SHOWN
 
 FRAMES, EVERY = 30, 2
 NAMED = 6  # latents that move most get a colour; the others are grey
-SIZE = (620, 560)
+SIZE = (620, 440)
 AROUND = 1.5  # of the garment's size: what is seen
 
 

@@ -122,6 +122,7 @@ def test_a_plot_stands_beside_the_scene():
     pixels = made.picture((200, 120))
     assert pixels.shape == (120, 200, 3)
     assert (pixels[:, -84:] == red).all()
+    assert made.picture().shape == (120, 276, 3)  # the scene keeps its width
     assert not (pixels[:, :100] == red).all(-1).any()
     assert WIDGET in made._repr_mimebundle_()
 
