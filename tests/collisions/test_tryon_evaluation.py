@@ -44,8 +44,8 @@ def test_the_fast_path_is_faster_and_its_parts_sum_to_the_frame():
     assert next(row for name, row in table.items() if "faster than the reference" in name).value > 5
     frame = next(row.value for name, row in table.items() if "one thread, median" in name)
     parts = [row.value for name, row in table.items() if "fast path, " in name]
-    assert len(parts) == 5
-    assert abs(sum(parts) - frame) < 0.5 * frame  # medians of parts
+    assert len(parts) == 6  # descriptor, regressor, decoder, corrective, garment model, what is between
+    assert abs(sum(parts) - frame) < frame  # medians of parts, of few frames
 
 
 def test_decoded_samples_do_not_collide():

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TorchNetworks, TryOn
-from workbench.collisions.tryon_kernels import KernelNetworks, quickest
+from workbench.collisions.tryon_kernels import KernelCorrective, KernelNetworks, quickest
 from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.extras import MissingExtra
 from workbench.formats import load_motion, motion_files
@@ -77,4 +78,25 @@ def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
         raise MissingExtra("no onnxruntime")
 
     monkeypatch.setattr("workbench.collisions.tryon_kernels.OnnxNetworks", absent)
-    assert quickest(fresh) is fresh
+    assert quickest(fresh).networks is fresh.networks
+
+
+def test_a_corrective_in_kernels_gives_what_torch_gives(tryon):
+    chance = torch.Generator().manual_seed(2)
+    corrective = PosedCorrective("tshirt", 31, 10, 5 * torch.randn(16, 3 * 4630, generator=chance), 64, chance)
+    with torch.no_grad():
+        for parameter in corrective.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=chance)
+            parameter.copy_(parameter.half().float())
+    slow = replace(tryon, corrective=corrective)
+    fast = quickest(slow)
+    assert isinstance(fast.corrective, KernelCorrective)
+    motion = load_motion(motion_files(None)[0], tryon.model.body).clip(0, 12)
+    betas = torch.linspace(-1, 1, 10)
+    one, two = slow.stream(betas), fast.stream(betas)
+    for r, h in zip(motion.rotations, motion.translation, strict=True):
+        torch.testing.assert_close(two(r, h).canonical, one(r, h).canonical, atol=1e-5, rtol=0)
+    plain = tryon.stream(betas)(motion.rotations[0], motion.translation[0]).canonical
+    assert float((fast.stream(betas)(motion.rotations[0], motion.translation[0]).canonical - plain).abs().max()) > 1e-3
+    whole = fast.run(motion, betas)
+    torch.testing.assert_close(whole.canonical, slow.run(motion, betas).canonical)

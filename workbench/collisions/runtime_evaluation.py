@@ -22,7 +22,7 @@ from workbench.collisions.garment_model import BodyState, GarmentModel, LocalMap
 from workbench.collisions.subspace import SHIPPED, NetworkConfig, Statistics, Subspace
 from workbench.collisions.subspace_evaluation import trained_garments
 from workbench.collisions.tryon import Networks, TorchNetworks, TryOn, load_tryon
-from workbench.collisions.tryon_kernels import KernelNetworks
+from workbench.collisions.tryon_kernels import KernelNetworks, quickest
 from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.evaluation_table import Row, at_least, at_most, told
 from workbench.extras import MissingExtra
@@ -67,12 +67,13 @@ def garment_rows(name: str, config: RuntimeEvaluation) -> list[Row]:
     tryon = load_tryon(name, config.networks)
     body = tryon.model.body
     motion = load_motion(motion_files(None)[0], body)
-    runtimes: dict[str, Networks] = {"torch": tryon.networks}
-    with contextlib.suppress(ValueError):  # networks of other sizes, or fresh from training
-        runtimes["own kernels"] = KernelNetworks(tryon.regressor, tryon.subspace)
+    runtimes = {"torch": tryon}
+    fast = quickest(tryon)
+    if isinstance(fast.networks, KernelNetworks):  # not so for networks of other sizes, or fresh from training
+        runtimes["own kernels"] = fast
     with contextlib.suppress(MissingExtra):  # the rows say which runtimes were there
-        runtimes["onnxruntime"] = OnnxNetworks(tryon.regressor, tryon.subspace)
-    laps = {runtime: Laps(replace(tryon, networks=networks), motion) for runtime, networks in runtimes.items()}
+        runtimes["onnxruntime"] = replace(tryon, networks=OnnxNetworks(tryon.regressor, tryon.subspace))
+    laps = {runtime: Laps(of_it, motion) for runtime, of_it in runtimes.items()}
     reference = Laps(_reference(tryon), motion)
     for _ in range(config.rounds):  # in turns, so that what else the machine does meets all alike
         for fast in laps.values():
@@ -149,7 +150,8 @@ class Laps:
     def __init__(self, tryon: TryOn, motion: Motion):
         self.motion, self.times = motion, {}
         networks = TimedNetworks(tryon.networks, self)
-        stream = replace(tryon, networks=networks).stream(tryon.model.body.mean_shape())
+        corrective = tryon.corrective and self.timed("corrective", tryon.corrective)
+        stream = replace(tryon, networks=networks, corrective=corrective).stream(tryon.model.body.mean_shape())
         stream.describe = self.timed("motion descriptor (Eq. 17)", stream.describe)
         stream.pose = self.timed("garment model (Eq. 7-8)", stream.pose)
         self.stream = self.timed("frame", stream)
@@ -220,4 +222,5 @@ def _reference(tryon: TryOn) -> TryOn:
     config = NetworkConfig(width=2000, rank=0)
     published = Subspace(tryon.garment.name, Statistics.blank(len(tryon.garment.vertices), config), config)
     model = GarmentModel(tryon.model.body, LearnedFields.default(tryon.model.body))
-    return replace(tryon, model=model, subspace=published, networks=TorchNetworks(tryon.regressor, published))
+    networks = TorchNetworks(tryon.regressor, published)
+    return replace(tryon, model=model, subspace=published, networks=networks, corrective=None)  # it is ours

@@ -95,6 +95,10 @@ class TorchNetworks(Networks):
         return self.subspace.decode(latent)
 
 
+# theta, beta, x_bar -> an offset of X: a PosedCorrective, or the same in another runtime
+Corrective = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
 @dataclass(frozen=True, eq=False)
 class TryOn:
     """Dresses a body in one garment."""
@@ -104,7 +108,7 @@ class TryOn:
     subspace: Subspace
     garment: Garment
     networks: Networks
-    corrective: PosedCorrective | None = None  # beyond the paper
+    corrective: Corrective | None = None  # beyond the paper
 
     @staticmethod
     def shipped(garment_name: str) -> "TryOn":

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
+from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, PosedCorrective
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, Subspace
 from workbench.collisions.tryon import Networks, TryOn
@@ -49,6 +50,24 @@ class Dense:
         )
 
 
+class Trunk:
+    """Dense layers, each perhaps with ReLU and LayerNorm, on fixed arrays."""
+
+    def __init__(self, name: str, layers: nn.Sequential, inputs: np.ndarray):
+        """Raises ValueError for a matrix that float16 cannot hold exactly."""
+        self.calls: list[Recorded] = []
+        self.outputs = inputs
+        for index, layer in enumerate(layers):
+            if isinstance(layer, nn.Linear):
+                made = Dense(f"{name} layer {index}", layer.weight, layer.bias, self.outputs)
+                self.calls.append(made.call)
+                self.outputs = made.outputs
+            elif isinstance(layer, nn.LayerNorm):  # the ReLU before it comes with it
+                scale, shift = (shared_array(p.detach().numpy(), wp.float32) for p in (layer.weight, layer.bias))
+                values = shared_array(self.outputs, wp.float32)
+                self.calls.append(Recorded(rectify_and_normalise, 1, scale, shift, layer.eps, values))
+
+
 class KernelNetworks(Networks):
     """The GRU and a decoder of low rank."""
 
@@ -78,18 +97,9 @@ class KernelNetworks(Networks):
         self.found = last.outputs
 
         self.latent = np.zeros(LATENTS, np.float32)
-        self.decoding: list[Recorded] = []
-        source = self.latent
-        for index, layer in enumerate(decoder.trunk.layers):
-            if isinstance(layer, nn.Linear):
-                made = Dense(f"the decoder's layer {index}", layer.weight, layer.bias, source)
-                self.decoding.append(made.call)
-                source = made.outputs
-            elif isinstance(layer, nn.LayerNorm):  # the ReLU before it comes with it
-                scale, shift = (shared_array(p.detach().numpy(), wp.float32) for p in (layer.weight, layer.bias))
-                values = shared_array(source, wp.float32)
-                self.decoding.append(Recorded(rectify_and_normalise, 1, scale, shift, layer.eps, values))
-        amounts = Dense("the decoder's amounts", decoder.amounts.weight, decoder.amounts.bias, source)
+        trunk = Trunk("the decoder's", decoder.trunk.layers, self.latent)
+        self.decoding = trunk.calls
+        amounts = Dense("the decoder's amounts", decoder.amounts.weight, decoder.amounts.bias, trunk.outputs)
         self.decoding.append(amounts.call)
         self.amounts = amounts.outputs
         self.spread = Dense("the decoder's basis", decoder.basis.T, decoder.middle, self.amounts)
@@ -112,9 +122,39 @@ class KernelNetworks(Networks):
         return torch.from_numpy(self.spread.outputs.copy()).reshape(-1, 3)
 
 
+class KernelCorrective:
+    """C(theta, beta, x_bar) of one frame; of many at once, as torch has it."""
+
+    @torch.no_grad()
+    def __init__(self, corrective: PosedCorrective):
+        """Raises ValueError for networks that are not as files hold them."""
+        self.corrective = corrective
+        first = corrective.layers[0]
+        assert isinstance(first, nn.Linear)
+        self.inputs = np.zeros(first.in_features, np.float32)
+        self.trunk = Trunk("the corrective's", corrective.layers, self.inputs)
+        basis = corrective.basis.T
+        self.spread = Dense("the corrective's basis", basis, basis.new_zeros(len(basis)), self.trunk.outputs)
+
+    def __call__(
+        self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
+    ) -> Float[Tensor, "*B N 3"]:
+        if latent.dim() > 1:
+            return self.corrective(rotations, betas, latent)
+        pose = (rotations.numpy()[1:] - np.eye(3, dtype=np.float32)).reshape(-1)
+        np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
+        for call in (*self.trunk.calls, self.spread.call):
+            call()
+        return torch.from_numpy(self.spread.outputs / np.float32(MILLI)).reshape(-1, 3)
+
+
 def quickest(tryon: TryOn) -> TryOn:
     """The same with the quickest networks there are: these kernels, else onnxruntime, else torch as it is."""
+    corrective = tryon.corrective
+    if isinstance(corrective, PosedCorrective):
+        with contextlib.suppress(ValueError):
+            corrective = KernelCorrective(corrective)
     for networks in (KernelNetworks, OnnxNetworks):
         with contextlib.suppress(ValueError, MissingExtra):
-            return replace(tryon, networks=networks(tryon.regressor, tryon.subspace))
-    return tryon
+            return replace(tryon, networks=networks(tryon.regressor, tryon.subspace), corrective=corrective)
+    return replace(tryon, corrective=corrective)
