@@ -174,7 +174,9 @@ def open_notebook(page: Any, lab: JupyterLab, name: str, cells: list[str]) -> No
     (lab.folder / f"{name}.ipynb").write_text(json.dumps(made))
     troubles = heard(page)
     page.add_locator_handler(page.locator(".jp-Dialog"), _answer_dialog)
-    page.add_locator_handler(page.locator(".jp-toastContainer button", has_text="No"), lambda no: no.first.click())
+    page.add_locator_handler(
+        page.locator(".jp-toastContainer button", has_text="No"), lambda no: no.first.dispatch_event("click")
+    )
     page.goto(f"{lab.address}lab/tree/{name}.ipynb?token={lab.token}", timeout=1e3 * PATIENCE)
     idle = '.jp-NotebookPanel:not(.lm-mod-hidden) .jp-Notebook-ExecutionIndicator[data-status="idle"]'
     page.locator(idle).first.wait_for(state="visible", timeout=1e3 * PATIENCE)
@@ -185,7 +187,7 @@ def _answer_dialog(dialog: Any) -> None:
     """A kernel is wanted; nothing else that JupyterLab offers is (open3d's Dash asks for a build)."""
     refuse, accept = dialog.first.locator(".jp-mod-reject"), dialog.first.locator(".jp-mod-accept")
     wanted = "Select Kernel" in dialog.first.inner_text() or not refuse.count()  # some only tell
-    (accept if wanted else refuse).first.click()
+    (accept if wanted else refuse).first.dispatch_event("click")  # at once: a busy machine animates slowly
 
 
 @dataclass(frozen=True)

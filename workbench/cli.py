@@ -116,8 +116,9 @@ def inspect(words: list[str]) -> int:
 
 
 def evaluate(words: list[str]) -> int:
-    name, rest = choice("workbench evaluate", "NAME", EVALUATIONS, words)
-    module_name, config_name = EVALUATIONS[name]
+    known = EVALUATIONS | registered_evaluations()
+    name, rest = choice("workbench evaluate", "NAME", known, words)
+    module_name, config_name = known[name]
     module = importlib.import_module(module_name)
     from workbench.evaluation_table import format_table, write_json
 
@@ -215,6 +216,12 @@ def plugged_in(group: str, name: str) -> Callable[..., Any] | None:
     for entry in importlib.metadata.entry_points(group=group, name=name):
         return entry.load()
     return None
+
+
+def registered_evaluations() -> dict[str, tuple[str, str]]:
+    """As EVALUATIONS, of what draws: `views`."""
+    registered = importlib.metadata.entry_points(group="workbench.evaluations")
+    return {entry.name: (entry.module, entry.attr) for entry in registered}
 
 
 # --- words
