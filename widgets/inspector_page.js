@@ -42,7 +42,10 @@
       view.setFrame(index);
       view.choose("garment", "depth inside the body");
       if (data.shown[index] !== frame) text += ` The 3-D view does not hold this frame; it shows frame ${data.shown[index]}.`;
-      if (vertex !== null) view.pick("garment", vertex);
+      if (vertex !== null) {
+        view.pick("garment", vertex);
+        view.lookAt("garment", vertex);
+      }
     }
     told.textContent = text;
     document.body.dataset.frame = frame;
@@ -71,6 +74,7 @@
       mark(row);
       goCell(+row.dataset.f, data.regions.indexOf(row.dataset.n));
       view?.pick("garment", +row.dataset.v);
+      view?.lookAt("garment", +row.dataset.v);
     });
   }
   all.addEventListener("click", () => { mark(null); isolate(null, false); });
@@ -80,6 +84,7 @@
     const first = document.querySelector("tr.go");
     handle.onFrame((frame) => cursor(data.shown[typeof frame === "number" ? frame : handle.frame()]));
     handle.setFrame(nearest(first ? +first.dataset.f : 0));
+    handle.nameFrames(data.shown);
     handle.ghost("body");
     cursor(data.shown[handle.frame()]);
     if (chosen !== null) isolate(...chosen);

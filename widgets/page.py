@@ -48,7 +48,8 @@ def page(
     `above` and `below` are HTML around the view, `style` further CSS, `script` further JavaScript.  When the view is
     ready, the event "workbench-view" comes to `document`; its `detail` (also `window.workbenchView`) is the handle:
     setFrame(i), frame(), frames(), play(), pause(), onFrame(f), onPick(f), read(layer, vertex), pick(layer, vertex),
-    isolateLayer(name or null), isolateRegion(layer, region or null), choose(layer, quantity), ghost(layer), png().
+    isolateLayer(name or null), isolateRegion(layer, region or null), choose(layer, quantity), ghost(layer), png(),
+    lookAt(layer, vertex, metres around it), nameFrames(one name a frame).
 
     Errors: NotBundled where the package was built without Node; ValueError as `widgets.wire.encode`.
     """

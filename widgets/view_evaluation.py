@@ -90,7 +90,7 @@ def rows(config: ViewEvaluation) -> list[Row]:
             table += shape_rows(view, cell.nth(0), lab, shown, config)
             table += motion_rows(notebook.run(1, VIEW), config)
             watched = Watched.of(notebook.run(2, VIEW))
-            handle = cell.nth(2).locator(".noUi-handle").last
+            handle = cell.nth(2).locator(".widget-hslider", has_text="latent 1").first.locator(".noUi-handle")
             delays = dragged(watched, handle, config.moves)
             table.append(at_most("latent slider to decoded, recounted, drawn: median", median(delays), "ms", 250))
             table.append(at_most("errors on the browser's console", len(notebook.troubles), "", 0))
@@ -153,7 +153,7 @@ def dragged(watched: Watched, handle: Any, moves: int, settled: bool = True) -> 
     delays = []
     for move in range(WARM + moves):
         step = move % 40
-        to = x + 3 * (step if step < 20 else 40 - step) + 2
+        to = x + 2 * (step if step < 20 else 40 - step) + 2  # the shortest slider ends 50 pixels off its middle
         delays.append(watched.delay(lambda to=to: page.mouse.move(to, y)))
         if settled:
             watched.settle()

@@ -51,6 +51,7 @@ def test_a_cell_shows_its_frame_region_and_depth(page, report):
     assert told.startswith("belly, frame 4 (0.13 s): ")
     assert f"{figures['per_frame']['deepest_mm'][4]:.2f} mm" in told
     assert page.evaluate("workbenchView.png()") != before
+    assert page.inner_text(".wbv-count") == "4 / 5"
     assert [select.input_value() for select in page.query_selector_all('select[title="isolate a region"]')] == [
         "belly"
     ] * 2

@@ -213,6 +213,7 @@ export class Layer {
     const scalars = this.scalars, u = this.uniforms;
     u.painted.value = scalars ? 1 : 0;
     u.flatness.value = scalars ? 0.8 : 0;
+    if (this.marked) this.marked.material.uniforms.size.value = (scalars ? 3 : 6) * this.ratio; // numbers stay seen
     if (scalars) {
       u.limits.value.set(...scalars.limits);
       u.map.value?.dispose();

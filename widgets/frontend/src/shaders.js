@@ -31,7 +31,7 @@ void main() {
   vPlace = place.xyz;
   vNormal = normalMatrix * normal;
   vColour = colourOf(value);
-  vMark = state == 1.0 ? 1.0 : 0.0;
+  vMark = state == 1.0 && painted == 0 ? 1.0 : 0.0; // painted numbers stay to be read; the dots tell the marks
   vHidden = state == 2.0 ? 1.0 : 0.0;              // NaN
   vFaint = isolated >= 0.0 && region != isolated ? 1.0 : 0.0;
   gl_Position = projectionMatrix * place;

@@ -219,6 +219,18 @@ export class Stage {
     this.dirty = true;
   }
 
+  /** Look from outside at a vertex, `reach` metres around it. */
+  lookAt(layer, vertex, reach) {
+    const view = this.views.find((one) => one.layers.includes(layer)), { camera, controls } = view.rig;
+    const away = reach / Math.tan((camera.fov * Math.PI) / 360), normals = layer.positions.normals;
+    controls.target.fromArray(layer.positions.attribute.array, 3 * vertex);
+    const outwards = normals ? new THREE.Vector3().fromArray(normals.array, 3 * vertex) : new THREE.Vector3();
+    if (!(outwards.length() > 0.5)) outwards.copy(camera.position).sub(controls.target).normalize();
+    camera.position.copy(controls.target).addScaledVector(outwards, away);
+    controls.update();
+    this.dirty = true;
+  }
+
   unpin() {
     this.pinned = null;
     this.dirty = true;

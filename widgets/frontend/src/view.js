@@ -220,7 +220,8 @@ class SceneView {
     this.root.dataset.frame = frame;
     if (this.time) {
       this.range.value = frame;
-      this.counter.textContent = `${frame} / ${this.header.frames - 1}`;
+      const named = (index) => this.frameNames?.[index] ?? index;
+      this.counter.textContent = `${named(frame)} / ${named(this.header.frames - 1)}`;
       this.drawCurve();
     }
     const told = [];
@@ -499,6 +500,8 @@ class SceneView {
       ghost: (layer) => this.ghost(layer),
       read: (layer, vertex) => this.stage.named(layer)[0]?.read(vertex),
       pick: (layer, vertex) => this.pick(this.stage.named(layer)[0], vertex),
+      lookAt: (layer, vertex, reach = 0.3) => this.stage.lookAt(this.stage.named(layer)[0], vertex, reach),
+      nameFrames: (names) => { this.frameNames = names; this.onFrame(); },
       onFrame: (listener) => this.listeners.frame.add(listener),
       onPick: (listener) => this.listeners.pick.add(listener),
       renew: (store) => this.renew(store),
