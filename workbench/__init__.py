@@ -19,9 +19,11 @@ The map
 | motion descriptor   | 5       | 17   | workbench.collisions.motion_descriptor | theta, H, K -> gamma (42)      |
 | posed collisions    |         |      | workbench.collisions.posed_collision | X, beta, theta -> hinge of depth |
 | regressor           | 5       | 1, 18 | workbench.collisions.regressor  | beta, gamma -> x_bar (T,25)          |
+| posed corrective    |         |      | workbench.collisions.posed_corrective | theta, beta, x_bar -> offset of X |
 | try-on              | 5-6     |      | workbench.collisions.tryon       | beta, motion -> posed garment        |
 | one frame, fast     | 4.2     | 7-8  | workbench.collisions.frame_posing | X, theta, H -> M_G                  |
 | networks, fast      | 6.3     | 1    | workbench.collisions.tryon_kernels | gamma, beta -> x_bar -> X          |
+| push-out (baseline) | 6       |      | workbench.collisions.push_out    | M_G, body -> pushed M_G, bulge       |
 | penetration         | 4.3, 6  |      | workbench.collisions.penetration | mesh, body -> vertices inside, depth |
 | demo                |         |      | workbench.tryon_demo             | try-on -> page, GLB, picture, report |
 
