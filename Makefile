@@ -25,7 +25,8 @@ test: .venv/installed-test
 
 # Pictures come before widgets, which a page without a kernel cannot show; links lead from page to page.
 html: .venv/installed-lab
-	$(BIN)/jupyter nbconvert --to html --execute --output-dir $(PAGES) notebooks/*.ipynb \
+	$(BIN)/jupyter nbconvert --to html --execute --ExecutePreprocessor.store_widget_state=False \
+	  --output-dir $(PAGES) notebooks/*.ipynb \
 	  --NbConvertBase.display_data_priority="['image/png', 'text/html', 'text/markdown', 'text/plain']"
 	@sed -i.bak 's/\.ipynb"/.html"/g' $(PAGES)/*.html && rm $(PAGES)/*.html.bak
 	@for page in $(PAGES)/*.html; do \
