@@ -13,6 +13,7 @@ from widgets.evaluation_view import list_view
 from widgets.fields_view import fields_view
 from widgets.garment_model_view import garment_model_view
 from widgets.inspection_panel import inspection_result_view, inspection_view
+from widgets.points_view import cloud_view, scans_view, trained_points_view
 from widgets.projection_view import ProjectionComparison, comparison_view, projector_view, sequence_view
 from widgets.regressor_view import regressor_view
 from widgets.sdf_view import sdf_view
@@ -28,8 +29,12 @@ from workbench.collisions.regressor import Regressor
 from workbench.collisions.sequences import SimulatedSequence
 from workbench.collisions.subspace import Subspace
 from workbench.collisions.tryon import TryOn, TryOnResult
+from workbench.formats.scans import Scan
 from workbench.inspector import InspectionResult
 from workbench.motion import Motion
+from workbench.points.clothed_points import ClothedPoints
+from workbench.points.scans import ScanFrame, ScanSequence
+from workbench.points.trained_points import TrainedPoints
 from workbench.tryon_demo import TryOnDemo
 
 
@@ -61,3 +66,8 @@ view.register(Regressor, regressor_view)
 view.register(list, list_view)
 view.register(Inspection, inspection_view)
 view.register(InspectionResult, inspection_result_view)
+view.register(ScanSequence, scans_view)
+view.register(ScanFrame, cloud_view)
+view.register(Scan, cloud_view)
+view.register(ClothedPoints, cloud_view)
+view.register(TrainedPoints, trained_points_view)
