@@ -1,4 +1,5 @@
-"""The tutorial as a set: every equation once, beside its call; assertions, exercises, links.  nbmake runs the cells."""
+"""The tutorials as a set: every equation once, beside its call; assertions, exercises,
+links.  nbmake runs the cells."""
 
 import ast
 import json
@@ -9,9 +10,10 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 STAGES = tuple(sorted(FOLDER.glob("1[0-8]_*.ipynb")))  # the first paper, without map and inspector
-TAUGHT = (*STAGES, FOLDER / "19_collision_inspector.ipynb")
+POINTS = tuple(sorted(FOLDER.glob("2[0-9]_*.ipynb")))  # the second paper
+TAUGHT = (*STAGES, FOLDER / "19_collision_inspector.ipynb", *POINTS)
 ALL = (FOLDER / "00_map.ipynb", *TAUGHT)
-EQUATIONS = range(1, 19)
+EQUATIONS, EQUATIONS_OF_POINTS = range(1, 19), range(1, 8)
 TAG = re.compile(r"\\tag\{(\d+)\}")
 SOLUTION = re.compile(r"<details><summary>Solution</summary>(.*?)</details>", re.DOTALL)
 
@@ -32,11 +34,17 @@ def code_of(path: Path) -> list[str]:
 
 
 def test_every_equation_of_the_first_paper_stands_once():
-    numbers = [int(n) for path in ALL for cell in cells_of(path) for n in TAG.findall(text_of(cell))]
+    first = [path for path in ALL if path not in POINTS]
+    numbers = [int(n) for path in first for cell in cells_of(path) for n in TAG.findall(text_of(cell))]
     assert sorted(numbers) == list(EQUATIONS)
 
 
-@pytest.mark.parametrize("path", STAGES, ids=lambda path: path.stem)
+def test_every_equation_of_the_second_paper_stands_once():
+    numbers = [int(n) for path in POINTS for cell in cells_of(path) for n in TAG.findall(text_of(cell))]
+    assert sorted(numbers) == list(EQUATIONS_OF_POINTS)
+
+
+@pytest.mark.parametrize("path", [*STAGES, *POINTS], ids=lambda path: path.stem)
 def test_an_equation_has_its_heading_and_section_and_its_call_follows(path):
     cells = cells_of(path)
     for cell, after in zip(cells, [*cells[1:], None]):
@@ -48,6 +56,7 @@ def test_an_equation_has_its_heading_and_section_and_its_call_follows(path):
 
 def test_the_stages_are_there():
     assert [path.stem[:2] for path in STAGES] == [str(n) for n in range(10, 19)]
+    assert [path.stem[:2] for path in POINTS] == [str(n) for n in range(20, 26)]
 
 
 @each
