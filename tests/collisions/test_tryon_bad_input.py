@@ -51,7 +51,8 @@ def test_a_stream_refuses_frames_that_are_not_finite_and_goes_on_as_if_they_had_
     clean, hurt = tryon.stream(torch.zeros(10)), tryon.stream(torch.zeros(10))
     frames = list(zip(motion.rotations[:4], motion.translation[:4], strict=True))
     for rotations, translation in frames[:2]:
-        clean(rotations, translation), hurt(rotations, translation)
+        for stream in (clean, hurt):
+            stream(rotations, translation)
     broken = frames[2][0].clone()
     broken[7, 1, 1] = value
     with pytest.raises(ValueError, match="frame 2 holds NaN or infinity; leave it out"):

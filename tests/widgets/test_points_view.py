@@ -41,7 +41,7 @@ def test_directions_have_colours_of_their_own_and_all_are_unit(rng):
 def test_fewer_surfels_are_larger_and_cover_the_same(sphere):
     few, many = (
         surfels(sphere.points[:100].numpy(), sphere.normals[:100].numpy()),
-        surfels(*map(np.asarray, (sphere.points, sphere.normals))),
+        surfels(sphere.points.numpy(), sphere.normals.numpy()),
     )
     assert 100 * few.radius**2 == pytest.approx(900 * many.radius**2)
 
