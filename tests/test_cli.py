@@ -106,14 +106,18 @@ def test_import_is_light_and_public_names_resolve():
     [
         (
             ["fly"],
-            "workbench: there is no command 'fly': workbench has demo, tryon, inspect, evaluate, train, export, doctor",
+            "workbench: there is no command 'fly': workbench has demo, tryon, inspect, evaluate, train, fit, animate, export, doctor",
         ),
         (
             ["evaluate"],
             "workbench: workbench evaluate needs a NAME, one of "
             "fields, projection, subspace, collisions, runtime; got nothing",
         ),
-        (["train", "cats"], "workbench: workbench train needs a STAGE, one of fields, subspace, regressor; got 'cats'"),
+        (
+            ["train", "cats"],
+            "workbench: workbench train needs a STAGE, one of fields, subspace, regressor, corrective, points; "
+            "got 'cats'",
+        ),
         (["doctor", "--fast"], "workbench: workbench doctor takes no options, got '--fast'"),
         (
             ["export", "absent.npz", "--out", "a.glb"],

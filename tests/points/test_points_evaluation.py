@@ -71,7 +71,7 @@ def test_a_model_has_no_error_on_what_it_made(folder):
     assert ratio.bound == "<= 0.85"
     assert found["fit of coat: loss after"].value < found["fit of coat: loss before"].value
     assert "unseen outfit: Chamfer below skinning of the scan" in found
-    assert found["forward: points apart"].value < 0.01
+    assert found["forward: points apart"].value < 0.5  # mm; what lies between decoded pixels, with random networks
     assert "training step: how much faster" not in found
     assert not any("1/4 of the data" in metric for metric in found)
     assert found["shipped"].bound == "<= 40"
