@@ -106,12 +106,13 @@ def test_import_is_light_and_public_names_resolve():
     [
         (
             ["fly"],
-            "workbench: there is no command 'fly': workbench has demo, tryon, inspect, evaluate, train, fit, animate, export, doctor",
+            "workbench: there is no command 'fly': workbench has "
+            "demo, tryon, inspect, evaluate, train, fit, animate, export, doctor",
         ),
         (
             ["evaluate"],
             "workbench: workbench evaluate needs a NAME, one of "
-            "fields, projection, subspace, collisions, runtime; got nothing",
+            "fields, projection, subspace, collisions, runtime, points, views; got nothing",
         ),
         (
             ["train", "cats"],
