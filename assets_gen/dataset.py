@@ -58,6 +58,8 @@ class DatasetConfig:
     """training motions of each family"""
     test_motions: int = 11
     """test sequences"""
+    only: tuple[str, ...] = ()
+    """names of motions: simulate these alone and make no set of them, as for scans; empty: the whole plan"""
     out: Path = Path("out/dataset")
     workers: int | None = None
     scheduler: str | None = None
@@ -121,9 +123,17 @@ def _dealt(rounds: int, round_: int, count: int) -> list[int]:
     return [(round_ * count + k) % (TRAINING_SHAPES - 1) for k in range(count)]
 
 
+def chosen(planned: list[PlannedSequence], only: Sequence[str]) -> list[PlannedSequence]:
+    """Those of these motions, or all.  ValueError for a motion that is not planned."""
+    unknown = sorted(set(only) - {one.motion for one in planned})
+    if unknown:
+        raise ValueError(f"the plan has no {', '.join(unknown)}; it has {', '.join(one.motion for one in planned)}")
+    return [one for one in planned if not only or one.motion in only]
+
+
 def simulated(config: DatasetConfig, body: Body) -> tuple[list[PlannedSequence], list[Path | None]]:
     """The files of the plan, made where they are missing (None where a simulation failed)."""
-    planned, garment = plan(config, body), Garment.load(config.garment)
+    planned, garment = chosen(plan(config, body), config.only), Garment.load(config.garment)
     tasks = [_task(config, body, garment, one) for one in planned]
     request = SimulationsConfig(
         out=config.out, workers=config.workers, scheduler=config.scheduler, record=config.record
@@ -146,12 +156,14 @@ def _task(config: DatasetConfig, body: Body, garment: Garment, one: PlannedSeque
 
 
 def run(config: DatasetConfig) -> None:
-    """Simulate and project what is missing, report every sequence, write the compact set."""
+    """Simulate and project what is missing, report every sequence, write the compact set (not of a chosen few)."""
     body = Body.default()
     planned, paths = simulated(config, body)
     made = [(one, path) for one, path in zip(planned, paths, strict=True) if path is not None]
     for _, path in made:
         print(report_line(path))
+    if config.only:
+        return
     gathered = gather(config, body, [(one, path) for one, path in made if one.split != "test"])
     target = config.out / f"{config.garment}.npz"
     gathered.save(target)

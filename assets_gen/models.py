@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 
+from assets_gen.dataset import LIVELY
+from assets_gen.motions import FAMILIES, generate
 from workbench.body.model import Body
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet, Projected, compact
 from workbench.collisions.diffused_body import GridFields
@@ -30,6 +32,7 @@ CODE = (
     "workbench.collisions.posed_collision",
     "workbench.learning.fit",
 )
+FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 # Tab. 1: what each row leaves out of Eq. 13
 ABLATIONS = {
     ".unsupervised": LossWeights(self_supervised=False),
@@ -50,6 +53,10 @@ class ModelsConfig:
     corrective: TrainCorrectiveConfig = TrainCorrectiveConfig()
     ablations: tuple[str, ...] = ()
     """rows of Tab. 1 to train instead, into `work`: .unsupervised .plain .2019"""
+    further: int = 3
+    """generated motions of each training family that only the corrective sees"""
+    further_lively: int = 30
+    """the same of the family that covers pose space most widely"""
 
 
 def run(config: ModelsConfig) -> None:
@@ -59,13 +66,25 @@ def run(config: ModelsConfig) -> None:
             ablation(config, suffix)
         return
     here: dict[str, Any] = {"garment": config.garment, "out": config.work}
+    further = further_motions(config)
     stories = {
         "subspace": train_subspace(replace(config.subspace, **here)).story,
         "regressor": train_regressor(replace(config.regressor, **here)).story,
-        "corrective": train_corrective(replace(config.corrective, **here)).story,
+        "corrective": train_corrective(replace(config.corrective, motions=further, **here)).story,
     }
     for stage, story in stories.items():
         _record(config, f"{config.garment}-{stage}.safetensors", story)
+
+
+def further_motions(config: ModelsConfig) -> Path:
+    """A folder of motions of the training families beyond those that any data set simulates."""
+    folder, skeleton = config.work / "work" / "motions", Body.default().skeleton
+    folder.mkdir(parents=True, exist_ok=True)
+    for family in (name for name, family in FAMILIES.items() if family.split == "train"):
+        for index in range(config.further_lively if family == LIVELY else config.further):
+            name = f"{family}_{FURTHER_FROM + index:02d}"
+            generate(name, skeleton).save(folder / f"{name}.npz")
+    return folder
 
 
 def ablation(config: ModelsConfig, suffix: str) -> None:

@@ -228,3 +228,13 @@ def test_asset_maker_speaks_the_same_way(capsys):
     line = refused(capsys, ["body", "--adults", "few"], main=assets_gen.main)
     assert "Error parsing --adults" in line
     assert Path(assets_gen.__file__).name == "__main__.py"
+
+
+def test_a_reader_that_has_seen_enough_ends_a_command_quietly():
+    code = "from workbench.cli import main; import sys; sys.exit(main(['fit', '--help']))"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == cli.UNREAD

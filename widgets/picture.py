@@ -222,8 +222,10 @@ def _colour(data: Any, layer: Mesh | Points, look: dict[str, Any], oversampling:
             "fmt": "%.3g",
         },
     }
+    if scalars.categories or not scalars.legend:
+        look["show_scalar_bar"] = False
     if scalars.categories:
-        look |= {"show_scalar_bar": False, "interpolate_before_map": False}
+        look["interpolate_before_map"] = False
 
 
 def _light(plotter: Any, camera: Camera) -> None:

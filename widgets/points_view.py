@@ -49,7 +49,13 @@ matplotlib.colormaps.register(ListedColormap((PALETTE[:, [0, 2, 1]] * (1, 1, -1)
 def normal_colours(normals: Float[ndarray, "N 3"]) -> Scalars:
     """Right, up and towards the front as red, green and blue, of the nearest of 256 directions."""
     nearest = np.asarray(KDTree(PALETTE).query(normals)[1])
-    return Scalars(nearest.astype(np.float32), "normal, up to down", limits=(0.0, COLOURS - 1.0), colour_map=COLOUR_MAP)
+    return Scalars(
+        nearest.astype(np.float32),
+        "normal, up to down",
+        limits=(0.0, COLOURS - 1.0),
+        colour_map=COLOUR_MAP,
+        legend=False,
+    )
 
 
 def surfels(points: Float[ndarray, "N 3"], normals: Float[ndarray, "N 3"], name: str = "surfels") -> Points:

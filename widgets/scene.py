@@ -25,7 +25,8 @@ class Scalars:
     """One number a vertex, shown by colour; `limits` are the numbers at both ends of the colour map.
 
     Values below `threshold` are marked: drawn in the warning colour, through whatever lies in front.
-    With `categories`, values are whole numbers that index them, and the legend names them.
+    With `categories`, values are whole numbers that index them, and the legend names them.  Without `legend`, colours
+    speak for themselves and no bar of numbers is drawn.
     """
 
     values: Float[ndarray, "*T N"]
@@ -35,6 +36,7 @@ class Scalars:
     colour_map: str = "viridis"
     threshold: float | None = None
     categories: tuple[str, ...] = ()
+    legend: bool = True
 
     def __post_init__(self) -> None:
         finite = self.values[np.isfinite(self.values)]

@@ -186,6 +186,7 @@ def _scalars(made: _Encoder, scalars: Scalars, key: str) -> dict[str, Any]:
         "map": f"map.{name}",
         "threshold": scalars.threshold,
         "categories": list(scalars.categories),
+        "legend": scalars.legend,
     }
 
 

@@ -10,6 +10,7 @@ import importlib.metadata
 import io
 import itertools
 import logging
+import os
 import re
 import sys
 import traceback
@@ -20,7 +21,7 @@ from typing import Annotated, Any
 from workbench import __version__
 from workbench.extras import missing_extra
 
-DONE, INTERNAL, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+DONE, INTERNAL, UNUSABLE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141  # the last two as a shell says it: 128 + signal
 OURS = ("workbench", "widgets", "assets_gen")
 
 # `workbench evaluate NAME`: where its config class and its `rows(config)` are
@@ -56,9 +57,12 @@ def ended(command: Callable[[], int], program: str) -> int:
     """Run `command` and turn however it ends into an exit status and what stderr says."""
     _log_to_output()
     try:
-        return command()
-    except Helped:
-        return DONE
+        status = _helped(command)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # `| head` has seen enough; the interpreter would say so again when it flushes
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
     except KeyboardInterrupt:
         sys.stderr.write(f"{program}: interrupted\n")
         return INTERRUPTED
@@ -68,6 +72,13 @@ def ended(command: Callable[[], int], program: str) -> int:
             return UNUSABLE
         traceback.print_exc()
         return INTERNAL
+
+
+def _helped(command: Callable[[], int]) -> int:
+    try:
+        return command()
+    except Helped:
+        return DONE
 
 
 def is_unusable_input(error: BaseException) -> bool:

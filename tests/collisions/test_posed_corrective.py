@@ -136,3 +136,33 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     with pytest.raises(ValueError, match="trained together"):
         TryOn.of(*networks, corrective=other)
     assert PosedCorrective.beside(tmp_path, "tshirt") is None
+
+
+def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):
+    training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, training.first_basis(worn), width=32)
+    ignored = training.unseen_joints()
+    names = {body.joint_names[joint] for joint in ignored}
+    assert {"LeftToeBase", "RightFingerBase"} <= names
+    assert not names & {"LeftArm", "RightForeArm", "LeftUpLeg", "LeftLeg", "Spine1", "Head"}
+    corrective.ignore(ignored)
+    optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
+    for _ in range(3):
+        optimizer.zero_grad()
+        training.loss(corrective, worn).backward()
+        optimizer.step()
+    bent = worn.rotations.clone()
+    bent[:, ignored] = axis_angle_to_matrix(torch.tensor([0.3, 0.2, -0.4]))
+    moved = corrective(worn.rotations, worn.betas, worn.latents)
+    assert moved.any()
+    torch.testing.assert_close(corrective(bent, worn.betas, worn.latents), moved)
+
+
+def test_further_motions_are_worn_in_training_alone(config, body, tmp_path):
+    training = CorrectiveTraining.of(replace(config, motions=tmp_path))
+    plain = CorrectiveTraining.of(config)
+    rotations = body.rest_rotations()[None].repeat(6, 1, 1, 1)
+    Motion(rotations, torch.zeros(6, 3), 30.0, body.skeleton, "still").save(tmp_path / "still.npz")
+    count = {name: (len(t.wear("train")), len(t.wear("validation"))) for name, t in (("a", training), ("b", plain))}
+    assert count["a"][0] - count["b"][0] == -(-6 // config.every) * config.shapes_a_motion
+    assert count["a"][1] == count["b"][1]

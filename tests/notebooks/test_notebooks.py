@@ -56,7 +56,7 @@ def test_an_equation_has_its_heading_and_section_and_its_call_follows(path):
 
 def test_the_stages_are_there():
     assert [path.stem[:2] for path in STAGES] == [str(n) for n in range(10, 19)]
-    assert [path.stem[:2] for path in POINTS] == [str(n) for n in range(20, 26)]
+    assert [path.stem[:2] for path in POINTS] == [str(n) for n in range(20, 28)]
 
 
 @each

@@ -129,7 +129,12 @@ def require_person_sized(points: Float[ndarray, "N 3"], name: str, unit: Unit = 
         if likely
         else "expected a person, 0.5 to 2.8 m"
     )
-    raise ValueError(f"{name} is {raw:.3g} {unit} large; {remedy}")
+    raise ValueError(f"{name} is {_plain(raw)} {unit} large; {remedy}")
+
+
+def _plain(value: float) -> str:
+    """Three digits, and never 1.59e+03."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def require_upright(points: Float[ndarray, "N 3"], name: str) -> None:

@@ -290,7 +290,7 @@ export class Layer {
   /** What a vertex is and holds in the frame that is shown. */
   read(vertex) {
     const p = this.positions.attribute.array;
-    const lines = this.described.scalars.map((s) => {
+    const lines = this.described.scalars.filter((s) => s.legend).map((s) => {
       const [T] = this.store.header.arrays[s.key].shape;
       const code = this.store.arrays[s.key][(T > 1 ? this.frame : 0) * this.count + vertex];
       if (code === NAN) return { name: s.name, text: "NaN" };

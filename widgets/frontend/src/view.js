@@ -172,7 +172,7 @@ class SceneView {
     const bars = new Map();
     for (const layer of this.stage.layers) {
       const s = layer.shown && layer.scalars;
-      if (s) bars.set(`${s.name}|${s.limits}|${s.map}`, { s, table: this.store.arrays[s.map] });
+      if (s && s.legend) bars.set(`${s.name}|${s.limits}|${s.map}`, { s, table: this.store.arrays[s.map] });
     }
     this.bars.replaceChildren(...[...bars.values()].map(({ s, table }) =>
       s.categories.length ? namesBar(s, table) : gradientBar(s, table)));
