@@ -18,6 +18,7 @@ from assets_gen.outfit_dataset import (
     plan,
     run,
     scannable,
+    shipped,
     split_of,
 )
 from assets_gen.outfits import ENSEMBLES
@@ -113,6 +114,14 @@ def test_a_pinched_vertex_is_forgiven_a_torn_garment_is_not():
     assert not judged(inside=MOST_INSIDE + 1)
     assert not judged(usual=record.usual_stretch + 0.01)
     assert not judged(rare=record.rare_stretch + 0.01)
+
+
+def test_of_an_outfit_that_is_held_out_two_sequences_ship():
+    rng = np.random.default_rng(0)
+    held_out, seen = min(HELD_OUT), "tshirt-skirt"
+    every = [scans(outfit, f"walk_{k:02d}", rng, 2, 50) for k in range(4) for outfit in (held_out, seen)]
+    kept = [(scan.outfit, scan.motion) for scan in shipped(every)]
+    assert kept == [(s.outfit, s.motion) for s in every if s.outfit == seen or s.motion in ("walk_00", "walk_01")]
 
 
 def test_single_garments_are_scanned_on_one_motion_a_family():

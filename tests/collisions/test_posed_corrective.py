@@ -8,7 +8,9 @@ import torch
 
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
+    SHAPE_CUT,
     CorrectiveTraining,
+    Jitter,
     PosedCorrective,
     TrainCorrectiveConfig,
     WornPoses,
@@ -166,3 +168,17 @@ def test_further_motions_are_worn_in_training_alone(config, body, tmp_path):
     count = {name: (len(t.wear("train")), len(t.wear("validation"))) for name, t in (("a", training), ("b", plain))}
     assert count["a"][0] - count["b"][0] == -(-6 // config.every) * config.shapes_a_motion
     assert count["a"][1] == count["b"][1]
+
+
+def test_jitter_leaves_the_root_and_without_it_everything(body):
+    worn = closed_arms(body, 3)
+    chance = torch.Generator().manual_seed(4)
+    same = worn.jittered(Jitter(0.0, 0.0, 0.0), chance)
+    torch.testing.assert_close((same.rotations, same.betas, same.latents), (worn.rotations, worn.betas, worn.latents))
+    other = worn.jittered(Jitter(pose=0.1, shape=9.0, latent=0.5), chance)
+    torch.testing.assert_close(other.rotations[:, 0], worn.rotations[:, 0])
+    turned = worn.rotations.mT @ other.rotations
+    torch.testing.assert_close(turned @ turned.mT, torch.eye(3).expand_as(turned), atol=1e-5, rtol=0)
+    angle = torch.arccos(((turned[:, 1:].diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    assert 0.1 < float(angle.square().mean().sqrt()) < 0.3  # three components of 0.1 each: 0.17
+    assert float(other.betas.abs().max()) == SHAPE_CUT

@@ -33,6 +33,7 @@ from workbench.collisions.subspace import LATENTS, Subspace, collision_loss
 from workbench.formats import load_motion, motion_files
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.network_file import read_network, write_network
 from workbench.learning.scalar_log import ScalarLog, read_curves
@@ -66,6 +67,20 @@ class CorrectiveWeights:
 
 
 @dataclass(frozen=True)
+class Jitter:
+    """Standard deviations of what is added to the poses, shapes and latents of every batch; ours.
+
+    A few hundred motions on as many shapes are learned by heart: without this, 6000 steps on the T-shirt left 0.100 %
+    of the vertices of validation motions inside, more than 2000 had (0.075 %).  The body is posed with what is added,
+    so the loss stays true; that limbs are clear of it is kept by the 30 mm that clearing leaves.
+    """
+
+    pose: float = 0.04  # radians, of each rotation vector but the root's
+    shape: float = 0.5  # of each component of beta
+    latent: float = 0.2
+
+
+@dataclass(frozen=True)
 class TrainCorrectiveConfig:
     """`workbench train corrective`: after subspace and regressor, from the training set's motions alone."""
 
@@ -79,11 +94,12 @@ class TrainCorrectiveConfig:
     rank: int = 96
     width: int = 512
     weights: CorrectiveWeights = CorrectiveWeights()
+    jitter: Jitter = Jitter()
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
     batch: int = 8  # frames a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=6000, learning_rate=2e-3, clip_norm=50.0))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=5000, learning_rate=2e-3, clip_norm=50.0))
     watch_every: int = 400
     seed: int = 0
 
@@ -141,7 +157,7 @@ class PosedCorrective(nn.Module):
         first.register_hook(lambda gradient: gradient * kept)  # pyright: ignore[reportCallIssue]
 
     def save(self, path: Path) -> None:
-        """The parameters, with what made them."""
+        """The parameters, with what made them; the basis as int8, whose rounding is hundredths of a millimetre."""
         metadata = {
             "format": FORMAT,
             "garment": self.garment_name,
@@ -149,7 +165,7 @@ class PosedCorrective(nn.Module):
             "shapes": str(self.shapes),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata)
+        write_network(self, path, metadata, coarse=("basis",))
 
     @staticmethod
     def load(path: str | Path) -> "PosedCorrective":
@@ -185,6 +201,17 @@ class WornPoses:
 
     def __getitem__(self, index: Tensor) -> "WornPoses":
         return WornPoses(self.rotations[index], self.betas[index], self.latents[index])
+
+    def jittered(self, jitter: Jitter, generator: torch.Generator) -> "WornPoses":
+        """The same with a little chance in everything but the root's rotation."""
+        turns = jitter.pose * torch.randn(self.rotations.shape[:-1], generator=generator)
+        turns[..., 0, :] = 0.0
+        shapes, latents = (torch.randn(x.shape, generator=generator) for x in (self.betas, self.latents))
+        return WornPoses(
+            self.rotations @ axis_angle_to_matrix(turns),
+            (self.betas + jitter.shape * shapes).clamp(-SHAPE_CUT, SHAPE_CUT),
+            self.latents + jitter.latent * latents,
+        )
 
     @staticmethod
     def of(
@@ -352,7 +379,7 @@ def run(config: TrainCorrectiveConfig) -> PosedCorrective:
 
     def loss_of(_: int, generator: torch.Generator) -> Float[Tensor, ""]:
         index = torch.randint(len(worn["train"]), (config.batch,), generator=generator)
-        return training.loss(corrective, worn["train"][index])
+        return training.loss(corrective, worn["train"][index].jittered(config.jitter, generator))
 
     def watch(step: int, loss: float) -> None:
         if not curves:
