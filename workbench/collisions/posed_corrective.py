@@ -157,7 +157,7 @@ class PosedCorrective(nn.Module):
         first.register_hook(lambda gradient: gradient * kept)  # pyright: ignore[reportCallIssue]
 
     def save(self, path: Path) -> None:
-        """The parameters, with what made them; the basis as int8, whose rounding is hundredths of a millimetre."""
+        """The parameters, with what made them; the basis as int8, a hundredth or two of an offset."""
         metadata = {
             "format": FORMAT,
             "garment": self.garment_name,
@@ -174,10 +174,11 @@ class PosedCorrective(nn.Module):
         metadata = found.metadata
         if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
-        basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
+        # half precision, in which the kernels compute
+        basis, width = found.tensors["basis"].half().float(), len(found.tensors["layers.0.bias"])
         sizes = (int(metadata["joints"]), int(metadata["shapes"]))
         corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), width)
-        corrective.load_state_dict(found.tensors)
+        corrective.load_state_dict({**found.tensors, "basis": basis})
         corrective.story = json.loads(metadata["story"])
         return corrective.eval()
 
