@@ -1,5 +1,6 @@
 """Laws of the corrective against collisions in posed space, small and hardly trained."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,3 +183,15 @@ def test_jitter_leaves_the_root_and_without_it_everything(body):
     angle = torch.arccos(((turned[:, 1:].diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
     assert 0.1 < float(angle.square().mean().sqrt()) < 0.3  # three components of 0.1 each: 0.17
     assert float(other.betas.abs().max()) == SHAPE_CUT
+
+
+def test_it_begins_with_another_where_one_is_given(config, tmp_path):
+    first = run(config)
+    for name in ("tshirt-subspace.safetensors", "tshirt-regressor.safetensors"):
+        shutil.copy(config.out / name, tmp_path)
+    slow = replace(config.fit, learning_rate=1e-9, last_rate=1e-9)
+    given = config.out / "tshirt-corrective.safetensors"
+    again = run(replace(config, out=tmp_path, seed=config.seed + 1, fit=slow, start=given))
+    for name, tensor in PosedCorrective.load(given).state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-5, rtol=1e-5)
+    assert again.story["start"]["curves"] == first.story["curves"]

@@ -91,6 +91,8 @@ class TrainCorrectiveConfig:
     out: Path = Path("out/models")
     # A folder of further motion files to learn from: no garment was ever simulated on them, and none need be.
     motions: Path | None = None
+    # A corrective of the same sizes to begin with, for other weights than it was trained with.
+    start: Path | None = None
     rank: int = 96
     width: int = 512
     weights: CorrectiveWeights = CorrectiveWeights()
@@ -375,6 +377,8 @@ def run(config: TrainCorrectiveConfig) -> PosedCorrective:
         config.width,
         torch.Generator().manual_seed(config.seed),
     )
+    if config.start is not None:
+        corrective.load_state_dict(PosedCorrective.load(config.start).state_dict())
     corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
 
@@ -400,6 +404,7 @@ def run(config: TrainCorrectiveConfig) -> PosedCorrective:
     corrective.eval()
     corrective.story = {
         "config": json.loads(json.dumps(asdict(config), default=str)),
+        "start": PosedCorrective.load(config.start).story if config.start else None,
         "curves": read_curves(work / "curves.jsonl"),
     }
     path = config.out / f"{name}-corrective.safetensors"
