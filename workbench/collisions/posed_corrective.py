@@ -150,13 +150,14 @@ class PosedCorrective(nn.Module):
 
     def ignore(self, joints: Sequence[int]) -> None:
         """Make the offset independent of these joints' rotations, also while it learns."""
-        first = self.layers[0].weight
-        kept = torch.ones_like(first)
+        first = self.layers[0]
+        assert isinstance(first, nn.Linear)
+        kept = torch.ones_like(first.weight)
         for joint in joints:
             if joint > 0:
                 kept[:, 9 * (joint - 1) : 9 * joint] = 0.0
-        first.data.mul_(kept)  # pyright: ignore[reportCallIssue]
-        first.register_hook(lambda gradient: gradient * kept)  # pyright: ignore[reportCallIssue]
+        first.weight.data.mul_(kept)
+        first.weight.register_hook(lambda gradient: gradient * kept)
 
     def save(self, path: Path) -> None:
         """The parameters, with what made them; the basis as int8, a hundredth or two of an offset."""
