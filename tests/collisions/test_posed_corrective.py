@@ -108,7 +108,11 @@ def test_training_writes_a_corrective_that_loads_continues_and_is_used(config, b
     back = PosedCorrective.load(config.out / "tshirt-corrective.safetensors")
     for name, tensor in first.state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], tensor)
-        torch.testing.assert_close(back.state_dict()[name], tensor, atol=2e-2, rtol=2e-3)
+        if name == "basis":  # int8, a step a column; then half precision
+            off = (back.state_dict()[name] - tensor).abs()
+            assert (off <= tensor.abs().amax(dim=0) * (0.5 / 127 + 1e-3) + 1e-6).all()
+        else:
+            torch.testing.assert_close(back.state_dict()[name], tensor, atol=2e-2, rtol=2e-3)
     assert [entry["step"] for entry in back.story["curves"]] == [2, 4]
     tryon = load_tryon("tshirt", config.out)
     assert tryon.corrective is not None
