@@ -28,7 +28,7 @@ def test_a_coarse_matrix_keeps_what_its_product_is_for(tmp_path):
     write_network(turned, tmp_path / "coarse.safetensors", {}, coarse=("view",))
     fine, coarse = ((tmp_path / f"{name}.safetensors").stat().st_size for name in ("fine", "coarse"))
     assert coarse < 0.55 * fine
-    x = torch.randn(20, 9000, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(400, 9000, generator=torch.Generator().manual_seed(0))  # with 20 the mean over them strays by half
     wanted = network(x).detach()
     found = x @ read_network(tmp_path / "coarse.safetensors", "train it").tensors["view"]
     assert float(((found - wanted).abs().mean(0) / wanted.std(0)).max()) < 0.005
