@@ -7,6 +7,7 @@ The T-shirt and the dress alone are not simulated again: `--sequences` names a f
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -210,10 +211,13 @@ def compact(scans: ScanSequence) -> ScanSequence:
 
 def shipped(scans: Sequence[ScanSequence]) -> list[ScanSequence]:
     """All sequences, but of each held-out outfit only the first few."""
-    left_out: list[ScanSequence] = []
-    for outfit in HELD_OUT:
-        left_out += [scan for scan in scans if scan.outfit == outfit][SHIPPED_UNSEEN:]
-    return [scan for scan in scans if not any(scan is one for one in left_out)]
+    seen = Counter[str]()
+    kept = []
+    for scan in scans:
+        seen[scan.outfit] += 1
+        if scan.outfit not in HELD_OUT or seen[scan.outfit] <= SHIPPED_UNSEEN:
+            kept.append(scan)
+    return kept
 
 
 def _ship(config: OutfitsConfig, scans: Sequence[ScanSequence]) -> None:

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from assets_gen.dataset import DatasetConfig, chosen
+from assets_gen.dataset import plan as dataset_plan
 from assets_gen.motions import FAMILIES
 from assets_gen.outfit_dataset import (
     HELD_OUT,
@@ -123,6 +125,17 @@ def test_of_an_outfit_that_is_held_out_two_sequences_ship():
     every = [scans(outfit, f"walk_{k:02d}", rng, 2, 50) for k in range(4) for outfit in (held_out, seen)]
     kept = [(scan.outfit, scan.motion) for scan in shipped(every)]
     assert kept == [(s.outfit, s.motion) for s in every if s.outfit == seen or s.motion in ("walk_00", "walk_01")]
+
+
+def test_single_garments_can_be_simulated_from_the_command_line():
+    body = Body.default()
+    for garment, rounds in (("tshirt", 12), ("dress", 5)):
+        planned = dataset_plan(DatasetConfig(garment=garment, per_family=rounds), body)
+        kept = chosen(planned, SCANNED_ALONE[garment])
+        assert {one.motion for one in kept} == set(SCANNED_ALONE[garment])
+    assert chosen(planned, ()) == planned
+    with pytest.raises(ValueError, match="the plan has no fly_00"):
+        chosen(planned, ("fly_00",))
 
 
 def test_single_garments_are_scanned_on_one_motion_a_family():

@@ -15,6 +15,7 @@ from workbench.collisions.posed_corrective import (
     PosedCorrective,
     TrainCorrectiveConfig,
     WornPoses,
+    begin_with,
     run,
 )
 from workbench.collisions.regressor import Regressor
@@ -199,3 +200,6 @@ def test_it_begins_with_another_where_one_is_given(config, tmp_path):
     for name, tensor in PosedCorrective.load(given).state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-5, rtol=1e-5)
     assert again.story["start"]["curves"] == first.story["curves"]
+    other = PosedCorrective("tshirt", first.joints, first.shapes, first.basis[:3].detach(), width=32)
+    with pytest.raises(ValueError, match="--rank"):
+        begin_with(other, first)
