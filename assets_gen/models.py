@@ -2,13 +2,16 @@
 
 import json
 import shutil
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from assets_gen.dataset import LIVELY
+from assets_gen.loose_motions import loosened
 from assets_gen.motions import FAMILIES, generate
 from workbench.body.model import Body
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet, Projected, compact
@@ -32,6 +35,7 @@ CODE = (
     "workbench.collisions.posed_collision",
     "workbench.learning.fit",
 )
+LOOSE_FROM, LOOSE_FRAMES = 100, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 # Tab. 1: what each row leaves out of Eq. 13
 ABLATIONS = {
@@ -53,10 +57,12 @@ class ModelsConfig:
     corrective: TrainCorrectiveConfig = TrainCorrectiveConfig()
     ablations: tuple[str, ...] = ()
     """rows of Tab. 1 to train instead, into `work`: .unsupervised .plain .2019"""
-    further: int = 3
+    further: int = 6
     """generated motions of each training family that only the corrective sees"""
-    further_lively: int = 30
+    further_lively: int = 60
     """the same of the family that covers pose space most widely"""
+    loose: int = 20
+    """loosened motions of each training family that only the corrective sees"""
 
 
 def run(config: ModelsConfig) -> None:
@@ -66,11 +72,11 @@ def run(config: ModelsConfig) -> None:
             ablation(config, suffix)
         return
     here: dict[str, Any] = {"garment": config.garment, "out": config.work}
-    further = further_motions(config)
+    unsimulated = (further_motions(config), loose_motions(config))
     stories = {
         "subspace": train_subspace(replace(config.subspace, **here)).story,
         "regressor": train_regressor(replace(config.regressor, **here)).story,
-        "corrective": train_corrective(replace(config.corrective, motions=further, **here)).story,
+        "corrective": train_corrective(replace(config.corrective, motions=unsimulated, **here)).story,
     }
     for stage, story in stories.items():
         _record(config, f"{config.garment}-{stage}.safetensors", story)
@@ -84,6 +90,18 @@ def further_motions(config: ModelsConfig) -> Path:
         for index in range(config.further_lively if family == LIVELY else config.further):
             name = f"{family}_{FURTHER_FROM + index:02d}"
             generate(name, skeleton).save(folder / f"{name}.npz")
+    return folder
+
+
+def loose_motions(config: ModelsConfig) -> Path:
+    """A folder of motions of the training families, short, whose joints go their own ways."""
+    folder, skeleton = config.work / "work" / "loose", Body.default().skeleton
+    folder.mkdir(parents=True, exist_ok=True)
+    for family in (name for name, family in FAMILIES.items() if family.split == "train"):
+        for index in range(LOOSE_FROM, LOOSE_FROM + config.loose):
+            motion = generate(f"{family}_{index}", skeleton, frames=LOOSE_FRAMES)
+            motion = loosened(motion, np.random.default_rng([index, zlib.crc32(family.encode())]))
+            motion.save(folder / f"{motion.name}.npz")
     return folder
 
 

@@ -36,9 +36,17 @@ ASSETS = Path("workbench/assets")
 CUT_BY = ("assets_gen.garments",)  # a change cuts anew
 MOST_INSIDE = 20  # vertices (0.3 %) inside the body that a scanned frame may have: pinched in folds, points hide them
 # which of the dataset's motions are scanned: a family each, on as many shapes as there are
+TESTS_ALONE = ("test_lunge_00", "test_wave_00", "test_jack_00")
 SCANNED_ALONE = {
-    "tshirt": ("walk_00", "dance_01", "punch_05", "excursion_09", "test_lunge_00", "test_wave_00", "test_jack_00"),
-    "dress": ("walk_00", "dance_01", "reach_03", "excursion_01", "test_lunge_00", "test_wave_00", "test_jack_00"),
+    "tshirt": (
+        *("walk_00", "dance_01", "squat_02", "twist_03", "kick_04"),
+        *("punch_05", "reach_06", "turn_07", "jump_08", "excursion_09"),
+        *TESTS_ALONE,
+    ),
+    "dress": (
+        *("walk_00", "dance_01", "excursion_01", "squat_02", "kick_02", "reach_03", "turn_04", "twist_00"),
+        *TESTS_ALONE,
+    ),
 }
 TEST_ROUND = 1  # the second round holds the test motions
 FIRST_TEST = 4  # index of the first outfit's test family; with 10 outfits none gets `bow`, which crushes cloth

@@ -9,18 +9,15 @@ import torch
 
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
-    SHAPE_CUT,
     CorrectiveTraining,
-    Jitter,
     PosedCorrective,
     TrainCorrectiveConfig,
-    WornPoses,
-    begin_with,
     run,
 )
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TryOn, load_tryon
+from workbench.collisions.worn_poses import SHAPE_CUT, Jitter, WornPoses
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
 from workbench.motion import Motion
@@ -104,6 +101,23 @@ def test_learning_frees_vertices(config, body):
     assert float(training.loss(corrective, worn).detach()) < 0.7 * first
 
 
+def test_only_what_stands_farther_off_than_needed_pays_more(config, body):
+    worn = closed_arms(body, 1)
+    offsets = torch.full((1, 3 * CorrectiveTraining.of(config).subspace.vertex_count), 5.0)  # millimetres
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, offsets, width=8)
+    torch.nn.init.ones_(corrective.layers[-1].bias)  # pyright: ignore[reportArgumentType]
+
+    def loss(**weights) -> float:
+        training = CorrectiveTraining.of(replace(config, weights=replace(config.weights, **weights)))
+        return float(training.loss(corrective, worn).detach())
+
+    without = loss(needless=0.0)
+    assert loss(needless=0.1, needed_to=1.0, needless_from=2.0) == pytest.approx(without)  # nothing is that far off
+    everywhere = loss(needless=0.1, needed_to=-2.0, needless_from=-1.0)
+    assert everywhere == pytest.approx(without + 0.1 * 75.0, rel=1e-3)
+    assert without < loss(needless=0.1) < everywhere
+
+
 def test_training_writes_a_corrective_that_loads_continues_and_is_used(config, body, small_set):
     first, again = run(config), run(config)
     back = PosedCorrective.load(config.out / "tshirt-corrective.safetensors")
@@ -167,7 +181,7 @@ def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):
 
 
 def test_further_motions_are_worn_in_training_alone(config, body, tmp_path):
-    training = CorrectiveTraining.of(replace(config, motions=tmp_path))
+    training = CorrectiveTraining.of(replace(config, motions=(tmp_path,)))
     plain = CorrectiveTraining.of(config)
     rotations = body.rest_rotations()[None].repeat(6, 1, 1, 1)
     Motion(rotations, torch.zeros(6, 3), 30.0, body.skeleton, "still").save(tmp_path / "still.npz")
@@ -200,6 +214,18 @@ def test_it_begins_with_another_where_one_is_given(config, tmp_path):
     for name, tensor in PosedCorrective.load(given).state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-5, rtol=1e-5)
     assert again.story["start"]["curves"] == first.story["curves"]
-    other = PosedCorrective("tshirt", first.joints, first.shapes, first.basis[:3].detach(), width=32)
-    with pytest.raises(ValueError, match="--rank"):
-        begin_with(other, first)
+    assert len(again.basis) == len(first.basis)
+    PosedCorrective("dress", first.joints, first.shapes, first.basis.detach(), width=32).save(tmp_path / "dress")
+    with pytest.raises(ValueError, match="is a corrective of 'dress'"):
+        run(replace(config, start=tmp_path / "dress"))
+
+
+def test_poses_are_left_out_where_the_body_overlaps_itself_under_the_garment(config, body):
+    training = CorrectiveTraining.of(config)
+    apart, folded = closed_arms(body, 2), closed_arms(body, 2)
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        arm = body.joint_names.index(f"{side}Arm")
+        apart.rotations[:, arm] = torch.eye(3)
+        folded.rotations[:, arm] = axis_angle_to_matrix(torch.tensor([0.0, 1.4 * sign, 0.0]))  # deep in the flank
+    kept = training.free(WornPoses.joined([apart, folded]))
+    torch.testing.assert_close(kept.rotations, apart.rotations)

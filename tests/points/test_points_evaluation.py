@@ -80,14 +80,18 @@ def test_a_model_has_no_error_on_what_it_made(folder):
 def test_what_was_not_trained_is_left_out(folder, body):
     trained = TrainedPoints.load(folder / "pop.safetensors", body)
     scans = [ScanSequence.load(folder / "test" / "tshirt.npz")]
-    alone = table_rows(trained, Rivals({}, {}), scans, body)
+    alone = table_rows(trained, Rivals({}, {}, {}), scans, body)
     assert len(alone) == 9
     assert not any("patches" in row.metric for row in alone)
     (folder / "pop-every4.safetensors").write_bytes((folder / "pop.safetensors").read_bytes())
     rivals = models_beside(folder / "pop.safetensors", trained, body)
-    assert (list(rivals.patches), list(rivals.fractions)) == (["tshirt"], [4])
+    assert (list(rivals.patches), list(rivals.fractions), list(rivals.alone)) == (["tshirt"], [4], [])
     found = {row.metric: row for row in table_rows(trained, rivals, scans, body)}
     assert found["Tab. 2: Chamfer of POP on 1/4 of the data / patches on all"].holds
+    (folder / "pop-tshirt.safetensors").write_bytes((folder / "pop.safetensors").read_bytes())
+    rivals = models_beside(folder / "pop.safetensors", trained, body)
+    found = {row.metric: row for row in table_rows(trained, rivals, scans, body)}
+    assert found["Tab. 2: normals of POP of all outfits / of one each"].value == pytest.approx(1, rel=1e-3)
 
 
 def test_the_time_of_a_training_holds_that_of_what_it_began_with():

@@ -47,12 +47,21 @@ class PosedCollision:
     def __call__(
         self, X: Float[Tensor, "B N 3"], rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "B K"]
     ) -> Float[Tensor, ""]:
+        return self.shortfall(self.distance_of(X, rotations, betas))
+
+    def distance_of(
+        self, X: Float[Tensor, "B N 3"], rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "B K"]
+    ) -> Float[Tensor, "B N"]:
+        """Signed distance of canonical garments to the bodies that wear them, as `distance`."""
         with torch.no_grad():
             state = self.model.state(rotations, betas)
             local = self.model.local_map(X.detach(), state)
             bodies = self.model.body.vertices(rotations, betas)
-        posed = local.posed(X)
-        return MILLI * (self.clearance - self.distance(posed, bodies)).clamp_min(0.0).mean()
+        return self.distance(local.posed(X), bodies)
+
+    def shortfall(self, distance: Float[Tensor, "B N"]) -> Float[Tensor, ""]:
+        """Mean over vertices of max(clearance - d, 0), millimetres."""
+        return MILLI * (self.clearance - distance).clamp_min(0.0).mean()
 
     def distance(self, posed: Float[Tensor, "B N 3"], bodies: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N"]:
         """Signed distance to each body, differentiable in the points; beyond `reach` it says `reach`, constant."""

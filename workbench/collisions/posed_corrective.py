@@ -10,45 +10,42 @@ C and on its Laplacian keeps it away from where it is not needed.
 
 import json
 import logging
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF, GridSDF
 from workbench.collisions.canonical_set import CanonicalSet
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_collision import PosedCollision
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import LATENTS, Subspace, collision_loss
+from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses
 from workbench.formats import load_motion, motion_files
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
-from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.network_file import read_network, write_network
 from workbench.learning.scalar_log import ScalarLog, read_curves
 from workbench.motion import Motion
-from workbench.store import atomic_write
 
 log = logging.getLogger(__name__)
 
 FORMAT = "corrective-1"
 MILLI = 1e3
-SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
 # Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
 # a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
 MOVES = 0.05
+MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself: beyond, nothing can be learned
 FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
 
 
@@ -61,23 +58,13 @@ class CorrectiveWeights:
     # |C|^2: square, so that no vertex goes far.  On validation motions 0.547 % are inside without C, error 19.1 mm;
     # after 600 steps 0.05 left 0.381 % and 18.8 mm, 0.012 0.179 % and 19.0 mm; |C|_1 x 0.15 left 0.055 % and 23.5 mm.
     size: float = 0.003
+    # |C|^2 again, of vertices that stand farther off the body than any collision asks for
+    needless: float = 0.03
+    needed_to: float = 6e-3  # metres off the posed body, up to which it does not count ...
+    needless_from: float = 16e-3  # ... and from which it counts in full
     laplacian: float = 0.5  # |Delta C|_1
     posed_clearance: float = 3e-3  # metres
     canonical_clearance: float = 2e-3  # metres, epsilon of Eq. 16
-
-
-@dataclass(frozen=True)
-class Jitter:
-    """Standard deviations of what is added to the poses, shapes and latents of every batch; ours.
-
-    A few hundred motions on as many shapes are learned by heart: without this, 6000 steps on the T-shirt left 0.098 %
-    of the vertices of validation motions inside, more than 2000 had (0.075 %).  The body is posed with what is added,
-    so the loss stays true; that limbs are clear of it is kept by the 30 mm that clearing leaves.
-    """
-
-    pose: float = 0.04  # radians, of each rotation vector but the root's
-    shape: float = 0.5  # of each component of beta
-    latent: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -89,9 +76,9 @@ class TrainCorrectiveConfig:
     data: Path | None = None
     # The folder with GARMENT-subspace and GARMENT-regressor, also written to.
     out: Path = Path("out/models")
-    # A folder of further motion files to learn from: no garment was ever simulated on them, and none need be.
-    motions: Path | None = None
-    # A corrective of the same sizes to begin with, for other weights than it was trained with.
+    # Folders of further motion files to learn from: no garment was ever simulated on them, and none need be.
+    motions: tuple[Path, ...] = ()
+    # A corrective to begin with, for other weights than it was trained with; rank and width are its own.
     start: Path | None = None
     rank: int = 96
     width: int = 512
@@ -193,71 +180,6 @@ class PosedCorrective(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class WornPoses:
-    """Poses of cleared motions, the shapes that wear them, and what the regressor says of them."""
-
-    rotations: Float[Tensor, "M J 3 3"]
-    betas: Float[Tensor, "M K"]
-    latents: Float[Tensor, "M L"]
-
-    def __len__(self) -> int:
-        return len(self.rotations)
-
-    def __getitem__(self, index: Tensor) -> "WornPoses":
-        return WornPoses(self.rotations[index], self.betas[index], self.latents[index])
-
-    def jittered(self, jitter: Jitter, generator: torch.Generator) -> "WornPoses":
-        """The same with a little chance in everything but the root's rotation."""
-        turns = jitter.pose * torch.randn(self.rotations.shape[:-1], generator=generator)
-        turns[..., 0, :] = 0.0
-        shapes, latents = (torch.randn(x.shape, generator=generator) for x in (self.betas, self.latents))
-        return WornPoses(
-            self.rotations @ axis_angle_to_matrix(turns),
-            (self.betas + jitter.shape * shapes).clamp(-SHAPE_CUT, SHAPE_CUT),
-            self.latents + jitter.latent * latents,
-        )
-
-    @staticmethod
-    def of(
-        motions: Sequence[Motion],
-        body: Body,
-        regressor: Regressor,
-        shapes_a_motion: int,
-        every: int,
-        generator: torch.Generator,
-    ) -> "WornPoses":
-        """Every motion on random shapes, cleared for each; minutes for a hundred motions."""
-        worn = [
-            (motion, torch.randn(body.shape_count, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT))
-            for motion in motions
-            for _ in range(shapes_a_motion)
-        ]
-
-        @torch.no_grad()
-        def one(pair: tuple[Motion, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-            motion, betas = pair
-            motion = motion.cleared(body, betas=betas)
-            latents = regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
-            index = torch.arange(0, len(motion), every)
-            return motion.rotations[index], betas.expand(len(index), -1), latents[index]
-
-        with ThreadPoolExecutor(2) as pool:
-            done = list(tqdm(pool.map(one, worn), total=len(worn), desc="clear for random shapes", mininterval=5.0))
-        return WornPoses(*(torch.cat(column) for column in zip(*done, strict=True)))
-
-    @staticmethod
-    def kept_at(path: Path, make: "CorrectiveTraining", split: str) -> "WornPoses":
-        """Read from `path` if an interrupted run left them there, else made and kept."""
-        if path.is_file():
-            with np.load(path) as file:
-                return WornPoses(*(torch.from_numpy(file[name]) for name in ("rotations", "betas", "latents")))
-        made = make.wear(split)
-        with atomic_write(path) as part:
-            np.savez(part, rotations=made.rotations.numpy(), betas=made.betas.numpy(), latents=made.latents.numpy())
-        return made
-
-
-@dataclass(frozen=True, eq=False)
 class CorrectiveTraining:
     """One run: data, the networks that are done, the loss."""
 
@@ -267,6 +189,7 @@ class CorrectiveTraining:
     regressor: Regressor
     model: GarmentModel
     sdf: BodySDF
+    start: PosedCorrective | None = None
 
     @staticmethod
     def of(config: TrainCorrectiveConfig) -> "CorrectiveTraining":
@@ -275,7 +198,11 @@ class CorrectiveTraining:
         subspace = Subspace.load(config.out / f"{name}-subspace.safetensors")
         regressor = Regressor.load(config.out / f"{name}-regressor.safetensors")
         model = GarmentModel(Body.default(), GridFields.default())
-        return CorrectiveTraining(config, data, subspace, regressor, model, GridSDF.default())
+        start = None
+        if config.start is not None:
+            start = PosedCorrective.load(config.start).train()
+            _check_start(start, name, model.body, config.start)
+        return CorrectiveTraining(config, data, subspace, regressor, model, GridSDF.default(), start)
 
     @cached_property
     def posed(self) -> PosedCollision:
@@ -294,21 +221,28 @@ class CorrectiveTraining:
 
     def wear(self, split: str) -> WornPoses:
         """The motions of a split on random shapes; training also takes those of `motions`."""
-        generator = torch.Generator().manual_seed(self.config.seed + {"train": 3, "validation": 5}[split])
-        body, fps = self.model.body, self.data.fps
+        config, body, fps = self.config, self.model.body, self.data.fps
         motions = [
             Motion(s.rotations, s.translation, fps, body.skeleton, s.motion_name) for s in self.data.of_split(split)
         ]
-        if self.config.motions is not None and split == "train":
-            motions += [load_motion(file, body) for file in motion_files(self.config.motions)]
-        return WornPoses.of(
-            motions,
-            body,
-            self.regressor,
-            self.config.shapes_a_motion,
-            self.config.every,
-            generator,
-        )
+        if split == "train":
+            motions += [load_motion(file, body) for folder in config.motions for file in motion_files(folder)]
+        seed = config.seed + {"train": 3, "validation": 5}[split]
+        kept = config.out / "work" / "cleared"
+        worn = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)(motions)
+        return self.free(worn)
+
+    @torch.no_grad()
+    def free(self, worn: WornPoses) -> WornPoses:
+        """Without the poses in which the body overlaps itself where the garment hangs: no garment lives there."""
+        free = []
+        for part in torch.arange(len(worn)).split(64):
+            some = worn[part]
+            posed = self.model.posed(self.subspace.decode(some.latents), self.model.state(some.rotations, some.betas))
+            bodies = self.model.body.vertices(some.rotations, some.betas)
+            overlap = penetration(bodies, self.model.body.faces, posed).overlap.float().mean(dim=1)
+            free.append(some[torch.nonzero(overlap <= MOST_OVERLAP)[:, 0]])
+        return WornPoses.joined(free)
 
     def needed(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
         """What would bring each vertex that is too near to the clearance: A^T (c - d) n, in canonical space."""
@@ -331,18 +265,33 @@ class CorrectiveTraining:
         rank = min(self.config.rank, len(size))
         return MILLI * FIRST_GAIN * directions[:rank] * (size[:rank, None] / len(needed) ** 0.5 + 1e-6)
 
+    def begin(self, worn: WornPoses) -> PosedCorrective:
+        """What training begins with: a corrective that corrects nothing, or `start`."""
+        if self.start is not None:
+            return self.start
+        config, body = self.config, self.model.body
+        sizes = (self.data.garment_name, len(body.parents), body.shape_count)
+        return PosedCorrective(*sizes, self.first_basis(worn), config.width, torch.Generator().manual_seed(config.seed))
+
     def loss(self, corrective: PosedCorrective, worn: WornPoses) -> Float[Tensor, ""]:
-        """The four terms, of one batch."""
+        """The terms of `CorrectiveWeights`, of one batch."""
         w = self.config.weights
         with torch.no_grad():
             X = self.subspace.decode(worn.latents)
         offset = corrective(worn.rotations, worn.betas, worn.latents)
         corrected = X + offset
-        hinge = self.posed(corrected, worn.rotations, worn.betas)
+        distance = self.posed.distance_of(corrected, worn.rotations, worn.betas)
+        hinge = self.posed.shortfall(distance)
         canonical = collision_loss(self.sdf, corrected, w.canonical_clearance)
-        size = MILLI**2 * offset.square().sum(-1).mean()
+        squares = MILLI**2 * offset.square().sum(-1)
+        room = ((distance.detach() - w.needed_to) / (w.needless_from - w.needed_to)).clamp(0.0, 1.0)
         rough = MILLI * apply_laplacian(self.laplacian, offset).abs().mean()
-        return w.hinge * hinge + w.canonical * canonical + w.size * size + w.laplacian * rough
+        return (
+            w.hinge * hinge
+            + w.canonical * canonical
+            + ((w.size + w.needless * room) * squares).mean()
+            + w.laplacian * rough
+        )
 
     @torch.no_grad()
     def measure(self, corrective: PosedCorrective, worn: WornPoses) -> dict[str, float]:
@@ -364,36 +313,31 @@ class CorrectiveTraining:
         }
 
 
-def begin_with(trained: PosedCorrective, corrective: PosedCorrective) -> None:
-    """Copy the parameters of a trained corrective.  ValueError for one of another garment or of other sizes."""
-    sizes = [
-        (c.garment_name, {name: tuple(tensor.shape) for name, tensor in c.state_dict().items()})
-        for c in (trained, corrective)
-    ]
-    if sizes[0] != sizes[1]:
+def _check_start(start: PosedCorrective, garment_name: str, body: Body, path: Path) -> None:
+    found, mine = (start.garment_name, start.joints, start.shapes), (garment_name, len(body.parents), body.shape_count)
+    if found != mine:
         raise ValueError(
-            f"the corrective to begin with is of {sizes[0][0]!r} with a basis of {sizes[0][1]['basis']}, expected "
-            f"{sizes[1][0]!r} with {sizes[1][1]['basis']}: give --garment, --rank and --width as it was trained with"
+            f"{path} is a corrective of {found[0]!r} for {found[1]} joints and {found[2]} shape components; "
+            f"needed to begin with: {mine[0]!r}, {mine[1]} and {mine[2]}"
         )
-    corrective.load_state_dict(trained.state_dict())
 
 
 def run(config: TrainCorrectiveConfig) -> PosedCorrective:
     """Train (or continue), write `out`/GARMENT-corrective.safetensors with its curves, return it."""
     training = CorrectiveTraining.of(config)
-    name, body = training.data.garment_name, training.model.body
+    name = training.data.garment_name
     work = config.out / "work" / f"{name}-corrective"
-    worn = {split: WornPoses.kept_at(work / f"{split}.npz", training, split) for split in ("train", "validation")}
-    corrective = PosedCorrective(
-        name,
-        len(body.parents),
-        body.shape_count,
-        training.first_basis(worn["train"]),
-        config.width,
-        torch.Generator().manual_seed(config.seed),
-    )
-    if config.start is not None:
-        begin_with(PosedCorrective.load(config.start), corrective)
+    corrective = train(training, {split: training.wear(split) for split in ("train", "validation")}, work)
+    path = config.out / f"{name}-corrective.safetensors"
+    corrective.save(path)
+    log.info("written: %s (%.1f MB)", path, path.stat().st_size / 1e6)
+    return corrective
+
+
+def train(training: CorrectiveTraining, worn: Mapping[str, WornPoses], work: Path) -> PosedCorrective:
+    """Learn from worn["train"], watch on worn["validation"]; state and curves lie in `work`."""
+    config, name = training.config, training.data.garment_name
+    corrective = training.begin(worn["train"])
     corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
 
@@ -422,7 +366,4 @@ def run(config: TrainCorrectiveConfig) -> PosedCorrective:
         "start": PosedCorrective.load(config.start).story if config.start else None,
         "curves": read_curves(work / "curves.jsonl"),
     }
-    path = config.out / f"{name}-corrective.safetensors"
-    corrective.save(path)
-    log.info("written: %s (%.1f MB)", path, path.stat().st_size / 1e6)
     return corrective

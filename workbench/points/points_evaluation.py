@@ -94,19 +94,22 @@ def spread(scan: ScanSequence, frames: int) -> ScanSequence:
 
 @dataclass(frozen=True)
 class Rivals:
-    """What lies beside a model: patches of each outfit, and POP trained on every 2nd, 4th, 8th frame."""
+    """What lies beside a model: patches and POP of each outfit alone, and POP on every 2nd, 4th, 8th frame."""
 
     patches: dict[str, TrainedPatches]
     fractions: dict[int, TrainedPoints]
+    alone: dict[str, TrainedPoints]
 
 
 def models_beside(path: Path, trained: TrainedPoints, body: Body) -> Rivals:
     """Those that were trained."""
     patches = {outfit: path.parent / f"patches-{outfit}.safetensors" for outfit in trained.outfits}
     fractions = {every: path.parent / f"pop-every{every}.safetensors" for every in FRACTIONS}
+    alone = {outfit: path.parent / f"pop-{outfit}.safetensors" for outfit in trained.outfits}
     return Rivals(
         {outfit: TrainedPatches.load(file, body) for outfit, file in patches.items() if file.is_file()},
         {every: TrainedPoints.load(file, body) for every, file in fractions.items() if file.is_file()},
+        {outfit: TrainedPoints.load(file, body) for outfit, file in alone.items() if file.is_file()},
     )
 
 
@@ -132,6 +135,7 @@ def table_rows(trained: TrainedPoints, rivals: Rivals, scans: Sequence[ScanSeque
         at_most("Tab. 2: normals of POP / patches", _mean(same, 1) / _mean(theirs, 1), "", 1),
         told("Tab. 2: point to plane of POP / patches", _mean(same, 2) / _mean(theirs, 2), ""),
     ]
+    found += alone_rows(trained, rivals.alone, scans, body)
     for every in FRACTIONS:
         if every not in rivals.fractions:
             _left_out(f"POP on 1/{every} of the data")
@@ -141,6 +145,28 @@ def table_rows(trained: TrainedPoints, rivals: Rivals, scans: Sequence[ScanSeque
         name = f"Tab. 2: Chamfer of POP on 1/{every} of the data / patches on all"
         found.append(at_most(name, ratio, "", 1) if every == QUARTER else told(name, ratio, ""))
     return found
+
+
+def alone_rows(
+    trained: TrainedPoints, alone: Mapping[str, TrainedPoints], scans: Sequence[ScanSequence], body: Body
+) -> list[Row]:
+    """POP of all outfits against one POP an outfit, where those were trained."""
+    common = [scan for scan in scans if scan.outfit in alone]
+    if not common:
+        return _left_out("POP of one outfit each")
+    ours = pop_errors(trained, ScanSet.of(body, common), body)
+    theirs = [
+        error
+        for outfit, model in alone.items()
+        for error in pop_errors(model, ScanSet.of(body, [scan for scan in common if scan.outfit == outfit]), body)
+    ]
+    seconds = sum(training_seconds(model.story) for model in alone.values())
+    return [
+        *_columns(f"POP of one outfit each ({', '.join(alone)})", theirs),
+        told("Tab. 2: training of POP of one outfit each", seconds, "CPU-s"),
+        told("Tab. 2: Chamfer of POP of all outfits / of one each", _mean(ours, 0) / _mean(theirs, 0), ""),
+        told("Tab. 2: normals of POP of all outfits / of one each", _mean(ours, 1) / _mean(theirs, 1), ""),
+    ]
 
 
 def training_seconds(story: Mapping[str, Any]) -> float:

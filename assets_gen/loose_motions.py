@@ -1,0 +1,50 @@
+"""Motions whose joints go their own ways.  motion, chance -> theta within anatomical limits; never simulated.
+
+A choreography shares a bend among the joints of the spine, lets the clavicle follow the arm and keeps feet planted.
+People, and the skeletons that motion capture is put on, share otherwise: here every joint that moves a garment wanders
+by itself about what the motion asks of it.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from assets_gen.motions import joint_angles, joint_frames, limit_of, wander
+from workbench.motion import Motion
+
+# Degrees of (flexion, abduction, twist) to either side, ours.  Hips bend to a deep crouch, which no family reaches.
+AMPLITUDES = {
+    "LowerBack": (20, 12, 12),
+    "Spine": (14, 10, 10),
+    "Spine1": (14, 10, 10),
+    "Neck": (16, 12, 15),
+    "Neck1": (14, 10, 12),
+    "Head": (12, 10, 12),
+    "Shoulder": (14, 14, 2),
+    "Arm": (30, 30, 40),
+    "ForeArm": (35, 2, 40),
+    "UpLeg": (55, 20, 25),
+    "Leg": (45, 0, 0),
+}
+RATE = 0.6  # Hz: the fastest a joint wanders
+
+
+def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
+    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS.
+
+    Feet slide and may sink: for networks that see theta alone.
+    """
+    frames, angles = joint_frames(motion.skeleton), joint_angles(motion)
+    times = np.arange(len(motion)) / motion.fps
+    rotations = motion.rotations.clone()
+    for joint, usual in angles.items():
+        amplitudes = AMPLITUDES.get(joint.removeprefix("Left").removeprefix("Right"))
+        if amplitudes is None:
+            continue
+        added = np.stack([wander(rng, times, -a, a, RATE) for a in amplitudes], axis=-1)
+        limit = limit_of(joint)
+        allowed = torch.tensor([limit.flexion, limit.abduction, limit.twist], dtype=torch.float64)
+        meant = torch.clamp(usual + torch.from_numpy(added), allowed[:, 0], allowed[:, 1])
+        rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
+    return replace(motion, rotations=rotations, name=f"{motion.name}_loose")

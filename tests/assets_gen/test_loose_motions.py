@@ -1,0 +1,36 @@
+"""Laws of the motions whose joints go their own ways."""
+
+import numpy as np
+import torch
+
+from assets_gen.loose_motions import AMPLITUDES, loosened
+from assets_gen.motions import beyond_limits, generate, joint_angles, limit_of
+from workbench.motion import Motion
+
+
+def test_joints_wander_within_their_limits_and_others_stay(body):
+    motion = generate("dance_03", body.skeleton, frames=40)
+    loose = loosened(motion, np.random.default_rng(1))
+    assert float(beyond_limits(loose).max()) < 0.1
+    before, after = joint_angles(motion), joint_angles(loose)
+    for joint, usual in before.items():
+        name = joint.removeprefix("Left").removeprefix("Right")
+        moved = (after[joint] - usual).abs().amax(dim=0)
+        if name not in AMPLITUDES:
+            assert float(moved.max()) < 0.1, joint
+        elif min(np.diff(limit_of(joint).flexion)) > 0:
+            assert float(moved.max()) > 1, joint
+    assert loose.name == "dance_03_loose"
+
+
+def test_the_same_chance_gives_the_same_motion_and_it_stays_smooth(body):
+    motion = generate("walk_02", body.skeleton, frames=60)
+    once, again = (loosened(motion, np.random.default_rng(7)) for _ in range(2))
+    torch.testing.assert_close(once.rotations, again.rotations)
+    assert fastest(once) < fastest(motion) + 0.2  # radians a frame
+
+
+def fastest(motion: Motion) -> float:
+    """The largest turn of a joint from one frame to the next."""
+    step = motion.rotations[:-1].mT @ motion.rotations[1:]
+    return float(torch.arccos(((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).max())
