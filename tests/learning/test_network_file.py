@@ -25,13 +25,31 @@ def test_a_coarse_matrix_keeps_what_its_product_is_for(tmp_path):
     turned = nn.Module()
     turned.register_buffer("view", network.weight.detach().T.contiguous())
     write_network(turned, tmp_path / "fine.safetensors", {})
-    write_network(turned, tmp_path / "coarse.safetensors", {}, coarse=("view",))
+    write_network(turned, tmp_path / "coarse.safetensors", {}, coarse={"view": 0})
     fine, coarse = ((tmp_path / f"{name}.safetensors").stat().st_size for name in ("fine", "coarse"))
     assert coarse < 0.55 * fine
     x = torch.randn(400, 9000, generator=torch.Generator().manual_seed(0))  # with 20 the mean over them strays by half
     wanted = network(x).detach()
     found = x @ read_network(tmp_path / "coarse.safetensors", "train it").tensors["view"]
     assert float(((found - wanted).abs().mean(0) / wanted.std(0)).max()) < 0.005
+
+
+def test_first_rows_of_a_coarse_matrix_may_stay_fine(tmp_path):
+    """As of a basis whose large components come first."""
+    basis = torch.randn(40, 500, generator=torch.Generator().manual_seed(0)) * torch.logspace(2, -2, 40)[:, None]
+    network = nn.Module()
+    network.register_buffer("basis", basis)
+    found = {}
+    for first in (0, 10):
+        write_network(network, tmp_path / "n.safetensors", {}, coarse={"basis": first})
+        found[first] = read_network(tmp_path / "n.safetensors", "train it").tensors["basis"]
+        assert found[first].shape == basis.shape
+        step = basis[first:].abs().amax(0) / 127
+        assert ((found[first][first:] - basis[first:]).abs() <= 0.51 * 9 / 8 * step).all()  # steps have 4 digits
+        assert torch.equal(found[first].half().float(), found[first])
+    torch.testing.assert_close(found[10][:10], basis[:10], rtol=1e-3, atol=0)
+    off = {first: float((one - basis).norm()) for first, one in found.items()}
+    assert off[10] < 0.1 * off[0]
 
 
 def test_missing_and_damaged_files_say_what_to_do(tmp_path):

@@ -126,7 +126,8 @@ class Regressor(nn.Module):
             "fps": str(self.fps),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata)
+        recurrent = [name for name in self.state_dict() if name.startswith("gru.weight_hh")]
+        write_network(self, path, metadata, coarse=dict.fromkeys([*recurrent, "gru.weight_ih_l1"], 0))
 
     @staticmethod
     def load(path: str | Path) -> "Regressor":

@@ -239,7 +239,7 @@ class Subspace(nn.Module):
             "network": json.dumps(asdict(self.config)),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata, coarse=("encoder.view",))
+        write_network(self, path, metadata, coarse={"encoder.view": 0, "decoder.basis": LATENTS})
 
     @staticmethod
     def load(path: str | Path) -> "Subspace":

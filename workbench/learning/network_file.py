@@ -1,13 +1,14 @@
 """Trained networks on disk.  parameters, what they are -> one safetensors file <-> the same; nothing is unpickled.
 
 Matrices are float16.  Vectors stay float32: the mean of a garment, a metre and a half above the floor, would be off by
-half a millimetre (measured: 0.22 mm on average over decoded garments).  A tall matrix whose product averages its
-rounding away, as that of an encoder's input, may be named to be int8 with a step a column.
+half a millimetre (measured: 0.22 mm on average over decoded garments).  A matrix whose product averages its rounding
+away, as that of an encoder's input or the small components of a basis, may be named to be int8 with a step a column.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from workbench.store import atomic_write
 
-STEPS = ".steps"  # after the name of an int8 matrix: its columns' steps
+STEPS, FIRST = ".steps", ".first"  # after the name of an int8 matrix: its columns' steps, and rows that stayed float16
 
 
 @dataclass(frozen=True)
@@ -28,15 +29,18 @@ class NetworkFile:
 
 
 def write_network(
-    network: nn.Module, path: Path, metadata: Mapping[str, str], coarse: Collection[str] = frozenset()
+    network: nn.Module, path: Path, metadata: Mapping[str, str], coarse: Mapping[str, int] = MappingProxyType({})
 ) -> None:
-    """Parameters and buffers, whole or not at all; the matrices named in `coarse` as int8."""
+    """Parameters and buffers, whole or not at all; matrices named in `coarse` as int8, but for so many first rows."""
     tensors = {}
     for name, tensor in network.state_dict().items():
         if name in coarse and tensor.dim() == 2:
-            steps = tensor.abs().amax(dim=0).clamp_min(1e-30) / 127
-            tensors[name] = torch.round(tensor / steps).to(torch.int8).contiguous()
+            first, rest = tensor[: coarse[name]], tensor[coarse[name] :]
+            steps = _short(rest.abs().amax(dim=0).clamp_min(1e-30) / 127)
+            tensors[name] = torch.round(rest / steps).to(torch.int8).contiguous()
             tensors[name + STEPS] = steps.contiguous()
+            if len(first):
+                tensors[name + FIRST] = _compact(first.detach()).contiguous()
         else:
             tensors[name] = _compact(tensor.detach()).contiguous()
     with atomic_write(path) as part:
@@ -50,13 +54,23 @@ def read_network(path: Path, remedy: str) -> NetworkFile:
     try:
         with safe_open(path, framework="pt") as file:
             stored = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118  not a dict
-            steps = {key: stored.pop(key) for key in list(stored) if key.endswith(STEPS)}
-            whole = {
-                key: tensor * steps[key + STEPS] if key + STEPS in steps else tensor for key, tensor in stored.items()
-            }
-            return NetworkFile(whole, file.metadata() or {})
+            parts = {key: stored.pop(key) for key in list(stored) if key.endswith((STEPS, FIRST))}
+            return NetworkFile({key: _whole(key, t, parts) for key, t in stored.items()}, file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise ValueError(f"network {path} is damaged ({error}); {remedy}") from error
+
+
+def _short(steps: Tensor) -> Tensor:
+    """Rounded up to 4 binary digits: times an int8 that is exact in float16, in which the kernels compute."""
+    mantissa, exponent = torch.frexp(steps)
+    return torch.ldexp((16 * mantissa).ceil() / 16, exponent)
+
+
+def _whole(name: str, tensor: Tensor, parts: Mapping[str, Tensor]) -> Tensor:
+    if name + STEPS not in parts:
+        return tensor
+    rest = tensor * parts[name + STEPS]
+    return torch.cat([parts[name + FIRST], rest]) if name + FIRST in parts else rest
 
 
 def _compact(tensor: Tensor) -> Tensor:

@@ -20,7 +20,9 @@ class LossWeights:
 
 # Ours, for clothes that stand off the body: Eq. 4 pulls both ways with 2e4 (x_i - y)^2, so at the published 2e3 |r_i|^2
 # a point settles 9 % short of the cloth, 1 cm at a hem that hangs 10 cm off
-LOOSE = LossWeights(displacement=2e2)
+# The published weight of normals is made for 401 epochs: with 4 instead of 1, 1,000 steps on four outfits ended with
+# normals 11 % nearer to the scans of motions kept apart (0.458 instead of 0.514), and Chamfer distances 3 % shorter.
+LOOSE = LossWeights(normal=4.0, displacement=2e2)
 
 
 @dataclass(frozen=True)
