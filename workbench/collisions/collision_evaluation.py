@@ -29,18 +29,19 @@ from workbench.collisions.sequences import SimulatedSequence, shipped_tests
 from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.collisions.subspace_evaluation import trained_garments, wrinkles
 from workbench.collisions.tryon import TryOn
+from workbench.collisions.worn_poses import SHAPE_CUT, cleared_for
 from workbench.evaluation_table import Row, at_least, at_most, told, within
 from workbench.formats import load_motion, motion_files
 from workbench.garments import Garment
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.geometry.laplacian import umbrella_laplacian
 from workbench.motion import Motion
+from workbench.store import Store
 
 log = logging.getLogger(__name__)
 R = TypeVar("R")
 
 MILLI, PERCENT = 1e3, 100.0
-SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there (facts.md 9)
 ALLOWED = {"tshirt": 0.05, "dress": 0.10}  # percent
 ALLOWED_ON_MOCAP = 0.09  # percent: the paper's full model on AMASS
 FAR_SHAPES = (1.0, 2.0, 3.0, 4.0, 5.0)  # Fig. 6: largest component, standard deviations; training is cut at 2.5
@@ -96,11 +97,12 @@ def pairs(motions: Sequence[Motion], body: Body, config: CollisionEvaluation) ->
 
 
 def _cleared(worn: Sequence[tuple[Motion, Tensor]], body: Body) -> list[tuple[Motion, Tensor]]:
+    """Each motion cleared for its shape, half a minute a pair; kept in the cache folder for the next evaluation."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(2) as pool:
-            work = pool.map(lambda pair: pair[0].cleared(body, betas=pair[1]), worn)
+            work = pool.map(lambda pair: cleared_for(pair[0], pair[1], body, Store()), worn)
             done = list(tqdm(work, total=len(worn), desc="clear", mininterval=5.0))
     finally:
         torch.set_num_threads(threads)

@@ -98,17 +98,19 @@ class Wearer:
     @torch.no_grad()
     def worn(self, motion: Motion, betas: Float[Tensor, " K"]) -> WornPoses:
         """One motion on one shape."""
-        motion = self.cleared(motion, betas)
+        motion = cleared_for(motion, betas, self.body, Store(self.kept))
         latents = self.regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
         index = torch.arange(0, len(motion), self.every)
         return WornPoses(motion.rotations[index], betas.expand(len(index), -1), latents[index])
 
-    def cleared(self, motion: Motion, betas: Float[Tensor, " K"]) -> Motion:
-        """Cleared for a shape, once."""
-        made_by = {"rotations": motion.rotations, "fps": motion.fps, "betas": betas}
 
-        def write(path: Path) -> None:
-            motion.cleared(self.body, betas=betas).save(path)
+def cleared_for(motion: Motion, betas: Float[Tensor, " K"], body: Body, store: Store) -> Motion:
+    """A motion cleared for a shape, made once and kept in `store`."""
+    seen = {"rotations": motion.rotations, "translation": motion.translation, "fps": motion.fps}
+    made_by = {**seen, "betas": betas, "body": (body.template, body.shape_directions)}
 
-        store = Store(self.kept)
-        return Motion.load(store.make(motion.name, made_by, write, code_version("workbench.motion_clearing")).path)
+    def write(path: Path) -> None:
+        motion.cleared(body, betas=betas).save(path)
+
+    name = "".join(letter if letter.isalnum() else "_" for letter in motion.name) or "motion"
+    return Motion.load(store.make(name, made_by, write, code_version("workbench.motion_clearing")).path)
