@@ -1,7 +1,8 @@
 """The one optimisation loop: parameters, a loss a step -> trained parameters, a checkpoint that resumes.
 
 A run that is killed continues from its checkpoint with the same parameters, Adam moments, step and generator state, so
-it ends where the uninterrupted run ends (bit by bit on one thread).
+it ends where the uninterrupted run ends (bit by bit on one thread).  Under torchrun all processes take each step
+together (`parallel`).
 """
 
 import json
@@ -9,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from workbench.learning.parallel import Processes, processes
 from workbench.store import atomic_write
 
 
@@ -69,32 +72,39 @@ def fit(
     every `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.
     `watch(step, loss)` is called after each step (logging).  Raises ValueError for a checkpoint of other parameters or
     another config, FloatingPointError when the loss is not finite.
+
+    Under torchrun the loss is the mean over the processes, each with chance of its own; only the first one writes the
+    checkpoint, shows progress and is watched.
     """
-    parameters = list(parameters)
+    parameters, team = list(parameters), processes()
+    team.own_chance(generator)
     optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
     start = 0
     if checkpoint is not None and checkpoint.exists():
-        start = _restore(checkpoint, parameters, optimizer, generator, config)
+        start = _restore(checkpoint, parameters, optimizer, generator, config, team)
+    team.share(parameters)
     losses: list[float] = []
-    with tqdm(range(start, config.steps), initial=start, total=config.steps, desc=label, mininterval=5.0) as bar:
+    progress: dict[str, Any] = {"desc": label, "mininterval": 5.0, "disable": not team.first}
+    with tqdm(range(start, config.steps), initial=start, total=config.steps, **progress) as bar:
         for step in bar:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate_at(step, config)
             optimizer.zero_grad(set_to_none=True)
             loss = loss_of(step, generator)
-            value = loss.item()
+            loss.backward()
+            value = team.average(parameters, loss)
             if not math.isfinite(value):
                 raise FloatingPointError(f"{label}: the loss is {value} at step {step}; lower the learning rate")
-            loss.backward()
             torch.nn.utils.clip_grad_norm_(parameters, config.clip_norm)
             optimizer.step()
             losses.append(value)
             bar.set_postfix(loss=f"{value:.3g}", refresh=False)
-            if watch is not None:
+            if watch is not None and team.first:
                 watch(step, value)
             done = step + 1
             if checkpoint is not None and (done % config.checkpoint_every == 0 or done == config.steps):
-                _save(checkpoint, parameters, optimizer, generator, config, done)
+                _save(checkpoint, parameters, optimizer, team, team.chances(generator), config, done)
+    team.wait()
     tail = losses[-max(1, config.steps // 10) :]
     return FitResult(resumed_at=start, steps=config.steps, loss=sum(tail) / len(tail) if tail else math.nan)
 
@@ -103,11 +113,14 @@ def _save(
     path: Path,
     parameters: Sequence[Tensor],
     optimizer: torch.optim.Adam,
-    generator: torch.Generator,
+    team: Processes,
+    chances: Sequence[Tensor],
     config: FitConfig,
     step: int,
 ) -> None:
-    tensors = {"generator": generator.get_state()}
+    if not team.first:
+        return
+    tensors = {_chance(rank): state for rank, state in enumerate(chances)}
     for index, parameter in enumerate(parameters):
         state = optimizer.state[parameter]
         tensors[f"parameter.{index}"] = parameter.detach().contiguous()
@@ -125,6 +138,7 @@ def _restore(
     optimizer: torch.optim.Adam,
     generator: torch.Generator,
     config: FitConfig,
+    team: Processes,
 ) -> int:
     try:
         with safe_open(path, framework="pt") as file:
@@ -138,6 +152,12 @@ def _restore(
             f"checkpoint {path} belongs to another run: its config is {metadata.get('config')}, this one's {expected}; "
             "delete it or choose another path"
         )
+    saved_by = sum(name.startswith(_chance(0)) for name in tensors)
+    if saved_by != team.count:
+        raise ValueError(
+            f"checkpoint {path} is of a run on {saved_by} processes, this one has {team.count}; start as many again "
+            f"(torchrun --nproc-per-node {saved_by}), delete it or choose another path"
+        )
     shapes = [tuple(p.shape) for p in parameters]
     saved = [tuple(tensors[f"parameter.{i}"].shape) for i in range(len(tensors)) if f"parameter.{i}" in tensors]
     if saved != shapes:
@@ -150,5 +170,9 @@ def _restore(
             "exp_avg": tensors[f"mean.{index}"],
             "exp_avg_sq": tensors[f"square.{index}"],
         }
-    generator.set_state(tensors["generator"])
+    generator.set_state(tensors[_chance(team.rank)])
     return step
+
+
+def _chance(rank: int) -> str:
+    return f"generator.{rank}" if rank else "generator"

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from workbench.learning.parallel import processes
 from workbench.store import atomic_write
 
 STEPS, FIRST = ".steps", ".first"  # after the name of an int8 matrix: its columns' steps, and rows that stayed float16
@@ -31,7 +32,10 @@ class NetworkFile:
 def write_network(
     network: nn.Module, path: Path, metadata: Mapping[str, str], coarse: Mapping[str, int] = MappingProxyType({})
 ) -> None:
-    """Parameters and buffers, whole or not at all; matrices named in `coarse` as int8, but for so many first rows."""
+    """Parameters and buffers, whole or not at all; matrices named in `coarse` as int8, but for so many first rows.
+
+    Under torchrun the first process writes, and all wait until it has.
+    """
     tensors = {}
     for name, tensor in network.state_dict().items():
         if name in coarse and tensor.dim() == 2:
@@ -43,8 +47,11 @@ def write_network(
                 tensors[name + FIRST] = _compact(first.detach()).contiguous()
         else:
             tensors[name] = _compact(tensor.detach()).contiguous()
-    with atomic_write(path) as part:
-        save_file(tensors, part, metadata=dict(metadata))
+    team = processes()
+    if team.first:
+        with atomic_write(path) as part:
+            save_file(tensors, part, metadata=dict(metadata))
+    team.wait()
 
 
 def read_network(path: Path, remedy: str) -> NetworkFile:
