@@ -24,6 +24,10 @@ class FakeConfig:
     steps: int = 3
     fault: str = ""
 
+    @staticmethod
+    def paper_size() -> "FakeConfig":
+        return FakeConfig(steps=1000, fault="")
+
 
 FAULTS = {
     "ours": lambda: int_of_ours("x"),
@@ -134,6 +138,12 @@ def test_unusable_words_are_refused_in_one_line(capsys, words, line):
 def test_options_reach_the_stage(fake_stage):
     assert cli.main(["train", "fields", "--steps", "7"]) == 0
     assert fake_stage == [FakeConfig(steps=7)]
+
+
+def test_paper_gives_the_published_sizes_where_a_stage_has_them_and_options_still_count(fake_stage):
+    assert cli.main(["train", "fields", "--paper"]) == 0
+    assert cli.main(["train", "fields", "--steps", "9", "--paper"]) == 0
+    assert fake_stage == [FakeConfig(steps=1000), FakeConfig(steps=9)]
 
 
 def test_bad_options_are_refused_in_one_line(capsys, fake_stage):

@@ -145,7 +145,10 @@ def train(words: list[str]) -> int:
     stage, rest = choice("workbench train", "STAGE", TRAININGS, words)
     module_name, config_name = TRAININGS[stage]
     module = importlib.import_module(module_name)
-    module.run(parsed(getattr(module, config_name), f"workbench train {stage}", rest))
+    config_type, default = getattr(module, config_name), None
+    if "--paper" in rest and hasattr(config_type, "paper_size"):
+        rest, default = [word for word in rest if word != "--paper"], config_type.paper_size()
+    module.run(parsed(config_type, f"workbench train {stage}", rest, default))
     return DONE
 
 
@@ -238,14 +241,18 @@ def registered_evaluations() -> dict[str, tuple[str, str]]:
 # --- words
 
 
-def parsed(config_type: Any, program: str, words: Sequence[str]) -> Any:
-    """A config from words, by tyro.  Raises Unusable with one line where tyro would draw a box."""
+def parsed(config_type: Any, program: str, words: Sequence[str], default: Any = None) -> Any:
+    """A config from words, by tyro; what they do not say is as in `default`, or the type's own defaults.
+
+    Raises Unusable with one line where tyro would draw a box.
+    """
     import tyro
 
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(config_type, prog=program, args=list(words))
+            start = {} if default is None else {"default": default}
+            return tyro.cli(config_type, prog=program, args=list(words), **start)
     except SystemExit as end:
         if not end.code:
             raise Helped from end

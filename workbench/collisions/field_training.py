@@ -52,7 +52,7 @@ class PoolConfig:
 class TrainFieldsConfig:
     """`workbench train fields`: the networks of Eq. 4-6 and the SDF of Eq. 12.
 
-    Defaults are sized for two CPU cores (about an hour); `paper_size()` trains 10 times longer on a denser pool.  The
+    Defaults are sized for two CPU cores (about an hour); --paper trains 10 times longer on a denser pool.  The
     paper names neither optimiser nor steps nor N: ours, measured.
     """
 

@@ -46,7 +46,10 @@ class RegressorWeights:
 
 @dataclass(frozen=True)
 class TrainRegressorConfig:
-    """`workbench train regressor`: from a trained subspace and the training set it was made of."""
+    """`workbench train regressor`: from a trained subspace and the training set it was made of.
+
+    The network has the published size; more steps are all that a larger machine would add.
+    """
 
     garment: str = "tshirt"
     # A set of canonical garments (.npz); the shipped one when absent.

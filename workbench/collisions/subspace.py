@@ -58,7 +58,10 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainSubspaceConfig:
-    """`workbench train subspace`: the VAE of one garment from its shipped (or given) training set."""
+    """`workbench train subspace`: the VAE of one garment from its shipped (or given) training set.
+
+    With --paper, defaults are the published sizes.
+    """
 
     garment: str = "tshirt"
     # A set of canonical garments (.npz, `python -m assets_gen dataset`); the shipped one when absent.
