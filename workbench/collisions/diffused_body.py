@@ -292,12 +292,13 @@ def body_fingerprint(body: Body) -> str:
 
 
 class LearnedFields(DiffusedFields):
-    """The paper's three networks: W~ p -> J with softmax, B~s concat(p, beta) -> 3, B~p concat(p, pose feature) -> 3;
-    each of 5 hidden layers of 256 with ReLU (facts.md 1).
+    """The paper's three networks: W~ p -> J with softmax, B~s p -> (K,3), B~p concat(p, pose feature) -> 3; each of 5
+    hidden layers of 256 with ReLU (facts.md 1).
 
-    Ours: p is centred and scaled to the unit box; the pose feature is projected onto what B_p can see of it
-    (feature @ pose_map @ pinv(pose_map)), which changes no value of B_p and spares the network 246 idle directions; the
-    networks of the offsets answer in units of OFFSET_UNIT.
+    Ours: B~s gives the K directions that beta mixes, because Eq. 5, an expectation, is linear in beta as B_s is; p is
+    centred and scaled to the unit box; the pose feature is projected onto what B_p can see of it (feature @ pose_map @
+    pinv(pose_map)), which changes no value of B_p and spares the network 246 idle directions; the networks of the
+    offsets answer in units of OFFSET_UNIT.
     """
 
     def __init__(self, body: Body, *, width: int = 256, depth: int = 5, generator: torch.Generator | None = None):
@@ -311,7 +312,7 @@ class LearnedFields(DiffusedFields):
         generator = generator or torch.Generator().manual_seed(0)
         sizes = {"width": width, "depth": depth, "generator": generator}
         self.weight_net = MLP(3, self.layout.joints, **sizes)
-        self.shape_net = MLP(3 + self.layout.shapes, 3, **sizes)
+        self.shape_net = MLP(3, 3 * self.layout.shapes, **sizes)
         self.pose_net = MLP(3 + len(body.pose_map), 3, **sizes)
 
     def normalised(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
@@ -321,8 +322,12 @@ class LearnedFields(DiffusedFields):
     def weights(self, points: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B N J"]:
         return self.weight_net(self.normalised(points)).softmax(-1)
 
+    def shape_directions(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B K 3"]:
+        """What beta mixes to B~s, metres a standard deviation."""
+        return OFFSET_UNIT * self.shape_net(self.normalised(points)).unflatten(-1, (-1, 3))
+
     def shape_offsets(self, points: Float[Tensor, "*B N 3"], betas: Float[Tensor, "*B K"]) -> Float[Tensor, "*B N 3"]:
-        return OFFSET_UNIT * self.shape_net(_beside(self.normalised(points), betas))
+        return torch.einsum("...k,...nki->...ni", betas, self.shape_directions(points))
 
     def pose_offsets(
         self, points: Float[Tensor, "*B N 3"], pose_feature: Float[Tensor, "*B Q"]
@@ -330,17 +335,13 @@ class LearnedFields(DiffusedFields):
         return OFFSET_UNIT * self.pose_net(_beside(self.normalised(points), pose_feature @ self.visible))
 
     def at(self, points: Float[Tensor, "*B N 3"]) -> FieldValues:
-        """All three, with the networks (which need not be linear) probed by secants about zero: K and P pairs of
+        """All three, with the network of B~p (which need not be linear) probed by secants about zero: P pairs of
         evaluations.  Slow; call `weights`, `shape_offsets` and `pose_offsets` where beta and theta are known."""
-        lead = points.shape[:-2]
-        shape, pose = [], []
-        for unit in torch.eye(self.layout.shapes):
-            betas = unit.expand(*lead, -1)
-            shape.append((self.shape_offsets(points, betas) - self.shape_offsets(points, -betas)) / 2)
+        lead, pose = points.shape[:-2], []
         for feature in self.lift:
             feature = feature.expand(*lead, -1)
             pose.append((self.pose_offsets(points, feature) - self.pose_offsets(points, -feature)) / 2)
-        return FieldValues(self.weights(points), torch.stack(shape, -2), torch.stack(pose, -2))
+        return FieldValues(self.weights(points), self.shape_directions(points), torch.stack(pose, -2))
 
     def rigging(
         self,
