@@ -196,3 +196,15 @@ def test_points_that_are_not_finite_are_refused(exact, grid):
     for fields in (exact, grid):
         with pytest.raises(ValueError, match="points must be finite"):
             fields.at(bad)
+
+
+def test_the_network_of_shape_is_linear_in_beta_and_its_directions_are_what_beta_mixes(body, rng):
+    fields = LearnedFields(body, width=16, depth=2)
+    points = torch.from_numpy(rng.normal(size=(20, 3))).float()
+    a, b = (torch.from_numpy(rng.normal(size=10)).float() for _ in range(2))
+    both = fields.shape_offsets(points, a + 2 * b)
+    torch.testing.assert_close(both, fields.shape_offsets(points, a) + 2 * fields.shape_offsets(points, b))
+    assert not fields.shape_offsets(points, torch.zeros(10)).any()
+    directions = fields.shape_directions(points)
+    torch.testing.assert_close(fields.at(points).shape_directions, directions)
+    torch.testing.assert_close(directions[:, 3], fields.shape_offsets(points, torch.eye(10)[3]))

@@ -77,7 +77,7 @@ def test_what_is_needed_brings_vertices_out(config, body):
     worn = WornPoses(body.rest_rotations()[None], torch.zeros(1, body.shape_count), torch.zeros(1, 25))
     with torch.no_grad():
         X = training.subspace.decode(worn.latents)
-    needed = training.needed(None, worn)
+    needed = training.needed(worn)
     state, bodies = training.model.state(worn.rotations, worn.betas), body.vertices(worn.rotations, worn.betas)
     local = training.model.local_map(X, state)
     before, after = (penetration(bodies, body.faces, local.posed(shape)).share for shape in (X, X + needed))
@@ -89,7 +89,7 @@ def test_what_is_needed_brings_vertices_out(config, body):
 
 def test_learning_frees_vertices(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    basis = training.first_basis(None, worn, config.rank)
+    basis = training.first_basis(worn)
     corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=32)
     optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
     first = float(training.loss(corrective, worn).detach())
@@ -162,9 +162,7 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
 
 def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    corrective = PosedCorrective(
-        "tshirt", len(body.parents), body.shape_count, training.first_basis(None, worn, 8), width=32
-    )
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, training.first_basis(worn), width=32)
     ignored = training.unseen_joints()
     names = {body.joint_names[joint] for joint in ignored}
     assert {"LeftToeBase", "RightFingerBase"} <= names
@@ -220,31 +218,6 @@ def test_it_begins_with_another_where_one_is_given(config, tmp_path):
     PosedCorrective("dress", first.joints, first.shapes, first.basis.detach(), width=32).save(tmp_path / "dress")
     with pytest.raises(ValueError, match="is a corrective of 'dress'"):
         run(replace(config, start=tmp_path / "dress"))
-
-
-def test_a_widened_corrective_is_the_same_function_until_it_learns(config, body):
-    training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    narrow = training.begin(worn)
-    torch.nn.init.normal_(narrow.layers[-1].weight)  # pyright: ignore[reportArgumentType]
-    wide = narrow.widened(training.first_basis(narrow, worn, 3))
-    given = (worn.rotations, worn.betas, worn.latents + 0.1)
-    torch.testing.assert_close(wide(*given), narrow(*given))
-    assert len(wide.basis) > len(narrow.basis)
-    training.loss(wide, worn).backward()
-    new = wide.layers[-1].weight.grad[len(narrow.basis) :]  # pyright: ignore[reportIndexIssue, reportOptionalSubscript]
-    assert new.abs().max() > 0
-
-
-def test_the_depth_of_a_pose_is_what_the_loss_says_of_it(config, body):
-    training, worn = CorrectiveTraining.of(config), closed_arms(body, 3)
-    worn.rotations[0] = body.rest_rotations()
-    depth = training.depth(None, worn)
-    assert depth[0] < depth[1]
-    X = training.canonical(None, worn)
-    one_by_one = [
-        float(training.posed(X[i : i + 1], worn.rotations[i : i + 1], worn.betas[i : i + 1])) for i in range(3)
-    ]
-    torch.testing.assert_close(depth, torch.tensor(one_by_one), rtol=1e-4, atol=1e-6)
 
 
 def test_poses_are_left_out_where_the_body_overlaps_itself_under_the_garment(config, body):
