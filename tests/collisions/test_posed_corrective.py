@@ -55,21 +55,13 @@ def closed_arms(body, count: int) -> WornPoses:
     return WornPoses(rotations, torch.zeros(count, body.shape_count), torch.zeros(count, 25))
 
 
-def last_of(corrective: PosedCorrective, limb: int) -> torch.nn.Linear:
-    """The layer that gives a limb's amounts."""
-    layers = corrective.limbs[limb]
-    assert isinstance(layers, torch.nn.Sequential) and isinstance(layers[-1], torch.nn.Linear)
-    return layers[-1]
-
-
 def test_it_begins_by_correcting_nothing_and_does_not_see_the_root(body):
     basis = torch.randn(6, 3 * 50)
-    every = [range(1, len(body.parents))]
-    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, every, width=16)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=16)
     pose = axis_angle_to_matrix(0.3 * torch.randn(4, len(body.parents), 3))
     given = (torch.randn(4, body.shape_count), torch.randn(4, 25))
     assert not corrective(pose, *given).any()
-    last_of(corrective, 0).weight.data.normal_()
+    torch.nn.init.normal_(corrective.layers[-1].weight)  # pyright: ignore[reportArgumentType]
     turned = pose.clone()
     turned[:, 0] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, 1.0]))
     torch.testing.assert_close(corrective(turned, *given), corrective(pose, *given))
@@ -97,7 +89,8 @@ def test_what_is_needed_brings_vertices_out(config, body):
 
 def test_learning_frees_vertices(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    corrective = training.begin(worn)
+    basis = training.first_basis(worn)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=32)
     optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
     first = float(training.loss(corrective, worn).detach())
     for _ in range(12):
@@ -111,8 +104,8 @@ def test_learning_frees_vertices(config, body):
 def test_only_what_stands_farther_off_than_needed_pays_more(config, body):
     worn = closed_arms(body, 1)
     offsets = torch.full((1, 3 * CorrectiveTraining.of(config).subspace.vertex_count), 5.0)  # millimetres
-    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, offsets, [[1]], width=8)
-    last_of(corrective, 0).bias.data.fill_(1.0)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, offsets, width=8)
+    torch.nn.init.ones_(corrective.layers[-1].bias)  # pyright: ignore[reportArgumentType]
 
     def loss(**weights) -> float:
         training = CorrectiveTraining.of(replace(config, weights=replace(config.weights, **weights)))
@@ -157,7 +150,7 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
         PosedCorrective.load(tmp_path / "bad.safetensors")
     with pytest.raises(ValueError, match="is no corrective"):
         PosedCorrective.load(config.out / "tshirt-regressor.safetensors")
-    other = PosedCorrective("dress", len(body.parents), body.shape_count, torch.zeros(2, 30), [[1]])
+    other = PosedCorrective("dress", len(body.parents), body.shape_count, torch.zeros(2, 30))
     networks = (
         Subspace.load(config.out / "tshirt-subspace.safetensors"),
         Regressor.load(config.out / "tshirt-regressor.safetensors"),
@@ -167,26 +160,24 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     assert PosedCorrective.beside(tmp_path, "tshirt") is None
 
 
-def test_each_limb_adds_its_own_offset_and_sees_no_other(config, body):
+def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    corrective = training.begin(worn)
-    for limb in range(len(corrective.limbs)):
-        last_of(corrective, limb).weight.data.normal_()
-    seen = [{body.joint_names[joint] for joint in some} for some in corrective.seen]
-    arms, legs = next(s for s in seen if "LeftArm" in s), next(s for s in seen if "LeftUpLeg" in s)
-    assert "LeftForeArm" in arms and "RightArm" not in arms and "RightUpLeg" in legs and "LeftArm" not in legs
-
-    def offset(*bent: str):
-        rotations = worn.rotations.clone()
-        for name in bent:
-            rotations[:, body.joint_names.index(name)] = axis_angle_to_matrix(torch.tensor([0.3, 0.2, -0.4]))
-        return corrective(rotations, worn.betas, worn.latents)
-
-    still = offset()
-    torch.testing.assert_close(offset("LeftToeBase", "RightFingerBase"), still)
-    arm, leg = offset("LeftArm") - still, offset("RightUpLeg") - still
-    assert arm.abs().max() > 0 and leg.abs().max() > 0
-    torch.testing.assert_close(offset("LeftArm", "RightUpLeg") - still, arm + leg, atol=1e-5, rtol=1e-4)
+    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, training.first_basis(worn), width=32)
+    ignored = training.unseen_joints()
+    names = {body.joint_names[joint] for joint in ignored}
+    assert {"LeftToeBase", "RightFingerBase"} <= names
+    assert not names & {"LeftArm", "RightForeArm", "LeftUpLeg", "LeftLeg", "Spine1", "Head"}
+    corrective.ignore(ignored)
+    optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
+    for _ in range(3):
+        optimizer.zero_grad()
+        training.loss(corrective, worn).backward()
+        optimizer.step()
+    bent = worn.rotations.clone()
+    bent[:, ignored] = axis_angle_to_matrix(torch.tensor([0.3, 0.2, -0.4]))
+    moved = corrective(worn.rotations, worn.betas, worn.latents)
+    assert moved.any()
+    torch.testing.assert_close(corrective(bent, worn.betas, worn.latents), moved)
 
 
 def test_further_motions_are_worn_in_training_alone(config, body, tmp_path):
@@ -224,7 +215,7 @@ def test_it_begins_with_another_where_one_is_given(config, tmp_path):
         torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-5, rtol=1e-5)
     assert again.story["start"]["curves"] == first.story["curves"]
     assert len(again.basis) == len(first.basis)
-    PosedCorrective("dress", first.joints, first.shapes, first.basis.detach(), first.seen).save(tmp_path / "dress")
+    PosedCorrective("dress", first.joints, first.shapes, first.basis.detach(), width=32).save(tmp_path / "dress")
     with pytest.raises(ValueError, match="is a corrective of 'dress'"):
         run(replace(config, start=tmp_path / "dress"))
 

@@ -3,9 +3,9 @@
 Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
 touches nothing ends inside the posed body (facts.md 9).  25 latents cannot say where: pushing the regressor's own
 output (tried before) took a third of the collisions off and cost 2.4 mm of vertex error.  This network adds an offset
-C(theta, beta, x_bar) of low rank to D(x_bar), a sum over limbs (`limb_sets`).  It learns from `PosedCollision` alone,
-on training motions worn by random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the
-canonical body, a penalty on C and on its Laplacian keeps it away from where it is not needed.
+C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `PosedCollision` alone, on training motions worn by
+random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on
+C and on its Laplacian keeps it away from where it is not needed.
 """
 
 import json
@@ -24,7 +24,6 @@ from workbench.collisions.body_sdf import BodySDF, GridSDF
 from workbench.collisions.canonical_set import CanonicalSet
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
-from workbench.collisions.limb_sets import limb_sets
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_collision import PosedCollision
 from workbench.collisions.regressor import Regressor
@@ -40,9 +39,12 @@ from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
 
-FORMAT = "corrective-2"
+FORMAT = "corrective-1"
 MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
+# Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
+# a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
+MOVES = 0.05
 MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself: beyond, nothing can be learned
 LOOKED_AT = 4  # for which one vertex in so many is looked at
 FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
@@ -81,7 +83,7 @@ class TrainCorrectiveConfig:
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
     rank: int = 96
-    width: int = 256  # of each limb's layers
+    width: int = 512
     weights: CorrectiveWeights = CorrectiveWeights()
     jitter: Jitter = Jitter()
     shapes_a_motion: int = 2  # random shapes that wear each training motion
@@ -94,8 +96,7 @@ class TrainCorrectiveConfig:
 
 
 class PosedCorrective(nn.Module):
-    """C(theta, beta, x_bar): amounts of a learned basis, a sum over sets of joints; of each set two dense layers, ReLU
-    and LayerNorm each, and a linear one."""
+    """C(theta, beta, x_bar): two dense layers, ReLU and LayerNorm each, then amounts of a learned basis."""
 
     def __init__(
         self,
@@ -103,18 +104,24 @@ class PosedCorrective(nn.Module):
         joints: int,
         shapes: int,
         basis: Float[Tensor, "R N3"],
-        seen: Sequence[Sequence[int]],
-        width: int = 256,
+        width: int = 512,
         generator: torch.Generator | None = None,
     ):
-        """basis: amounts -> flattened offsets, millimetres; seen: the sets of joints, without the root."""
+        """basis: amounts -> flattened offsets, millimetres."""
         super().__init__()
         generator = generator or torch.Generator().manual_seed(0)
         self.garment_name, self.joints, self.shapes = garment_name, joints, shapes
-        self.seen = tuple(tuple(some) for some in seen)
-        self.limbs = nn.ModuleList(
-            _layers(9 * len(some) + shapes + LATENTS, width, len(basis), generator) for some in self.seen
-        )
+        inputs = 9 * (joints - 1) + shapes + LATENTS
+        layers: list[nn.Module] = []
+        for size in (inputs, width):
+            dense = nn.Linear(size, width)
+            nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
+            nn.init.zeros_(dense.bias)
+            layers += [dense, nn.ReLU(), nn.LayerNorm(width, eps=1e-3)]
+        last = nn.Linear(width, len(basis))
+        nn.init.zeros_(last.weight)  # it begins by correcting nothing
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(*layers, last)
         self.basis = nn.Parameter(basis.clone())
         self.story: dict = {}
 
@@ -126,15 +133,20 @@ class PosedCorrective(nn.Module):
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
     ) -> Float[Tensor, "*B N 3"]:
         """The offset of X, metres, canonical space; the root's rotation does not matter."""
-        pose = rotations - torch.eye(3)
-        rest = FEATURE_SCALE * torch.cat([betas, latent], dim=-1)
-        amounts = torch.stack(
-            [
-                layers(torch.cat([pose[..., some, :, :].flatten(-3), rest], dim=-1))
-                for some, layers in zip(self.seen, self.limbs, strict=True)
-            ]
-        ).sum(dim=0)
-        return (amounts @ self.basis).unflatten(-1, (-1, 3)) / MILLI
+        pose = (rotations[..., 1:, :, :] - torch.eye(3)).flatten(-3)
+        seen = torch.cat([pose, FEATURE_SCALE * betas, FEATURE_SCALE * latent], dim=-1)
+        return (self.layers(seen) @ self.basis).unflatten(-1, (-1, 3)) / MILLI
+
+    def ignore(self, joints: Sequence[int]) -> None:
+        """Make the offset independent of these joints' rotations, also while it learns."""
+        first = self.layers[0]
+        assert isinstance(first, nn.Linear)
+        kept = torch.ones_like(first.weight)
+        for joint in joints:
+            if joint > 0:
+                kept[:, 9 * (joint - 1) : 9 * joint] = 0.0
+        first.weight.data.mul_(kept)
+        first.weight.register_hook(lambda gradient: gradient * kept)
 
     def save(self, path: Path) -> None:
         """The parameters, with what made them; the basis as int8, a hundredth or two of an offset."""
@@ -143,7 +155,6 @@ class PosedCorrective(nn.Module):
             "garment": self.garment_name,
             "joints": str(self.joints),
             "shapes": str(self.shapes),
-            "seen": json.dumps(self.seen),
             "story": json.dumps(self.story),
         }
         write_network(self, path, metadata, coarse={"basis": 0})
@@ -155,9 +166,9 @@ class PosedCorrective(nn.Module):
         metadata = found.metadata
         if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
-        basis, width = found.tensors["basis"], len(found.tensors["limbs.0.0.bias"])
-        sizes, seen = (int(metadata["joints"]), int(metadata["shapes"])), json.loads(metadata["seen"])
-        corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), seen, width)
+        basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
+        sizes = (int(metadata["joints"]), int(metadata["shapes"]))
+        corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), width)
         corrective.load_state_dict(found.tensors)
         corrective.story = json.loads(metadata["story"])
         return corrective.eval()
@@ -167,19 +178,6 @@ class PosedCorrective(nn.Module):
         """The corrective of a garment in a folder of networks, if there is one."""
         path = folder / f"{garment_name}-corrective.safetensors"
         return PosedCorrective.load(path) if path.is_file() else None
-
-
-def _layers(inputs: int, width: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for size in (inputs, width):
-        dense = nn.Linear(size, width)
-        nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
-        nn.init.zeros_(dense.bias)
-        layers += [dense, nn.ReLU(), nn.LayerNorm(width, eps=1e-3)]
-    last = nn.Linear(width, outputs)
-    nn.init.zeros_(last.weight)  # it begins by correcting nothing
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(*layers, last)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +214,11 @@ class CorrectiveTraining:
         garment = Garment.load(self.data.garment_name)
         return umbrella_laplacian(garment.faces, len(garment.vertices))
 
-    def seen(self) -> tuple[tuple[int, ...], ...]:
-        """The sets of joints that the offset is a sum over."""
+    def unseen_joints(self) -> list[int]:
+        """Joints that neither move the garment nor hang on one that does."""
         body, garment = self.model.body, Garment.load(self.data.garment_name)
-        return limb_sets(self.model.fields.weights(garment.vertices), body.parents)
+        moves = self.model.fields.weights(garment.vertices).amax(dim=0) > MOVES
+        return [joint for joint in range(1, len(moves)) if not (moves[joint] or moves[body.parents[joint]])]
 
     def wear(self, split: str) -> WornPoses:
         """The motions of a split on random shapes; training also takes those of `motions`."""
@@ -274,8 +273,7 @@ class CorrectiveTraining:
         config, body = self.config, self.model.body
         basis = self.first_basis(worn)
         sizes = (self.data.garment_name, len(body.parents), body.shape_count)
-        generator = torch.Generator().manual_seed(config.seed)
-        return PosedCorrective(*sizes, basis, self.seen(), config.width, generator)
+        return PosedCorrective(*sizes, basis, config.width, torch.Generator().manual_seed(config.seed))
 
     def loss(self, corrective: PosedCorrective, worn: WornPoses) -> Float[Tensor, ""]:
         """The terms of `CorrectiveWeights`, of one batch."""
@@ -342,6 +340,7 @@ def train(training: CorrectiveTraining, worn: Mapping[str, WornPoses], work: Pat
     """Learn from worn["train"], watch on worn["validation"]; state and curves lie in `work`."""
     config, name = training.config, training.data.garment_name
     corrective = training.begin(worn["train"])
+    corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
 
     def loss_of(_: int, generator: torch.Generator) -> Float[Tensor, ""]:

@@ -129,31 +129,22 @@ class KernelCorrective:
     def __init__(self, corrective: PosedCorrective):
         """Raises ValueError for networks that are not as files hold them."""
         self.corrective = corrective
-        self.inputs, self.calls, self.of_limbs = [], [], []
-        for limb, layers in enumerate(corrective.limbs):
-            assert isinstance(layers, nn.Sequential) and isinstance(layers[0], nn.Linear)
-            inputs = np.zeros(layers[0].in_features, np.float32)
-            trunk = Trunk(f"the corrective's limb {limb}", layers, inputs)
-            self.inputs.append(inputs)
-            self.calls += trunk.calls
-            self.of_limbs.append(trunk.outputs)
+        first = corrective.layers[0]
+        assert isinstance(first, nn.Linear)
+        self.inputs = np.zeros(first.in_features, np.float32)
+        self.trunk = Trunk("the corrective's", corrective.layers, self.inputs)
         basis = corrective.basis.T
-        self.amounts = np.zeros(basis.shape[1], np.float32)
-        self.spread = Dense("the corrective's basis", basis, basis.new_zeros(len(basis)), self.amounts)
+        self.spread = Dense("the corrective's basis", basis, basis.new_zeros(len(basis)), self.trunk.outputs)
 
     def __call__(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
     ) -> Float[Tensor, "*B N 3"]:
         if latent.dim() > 1:
             return self.corrective(rotations, betas, latent)
-        pose = rotations.numpy() - np.eye(3, dtype=np.float32)
-        rest = FEATURE_SCALE * np.concatenate([betas.numpy(), latent.numpy()])
-        for seen, inputs in zip(self.corrective.seen, self.inputs, strict=True):
-            np.concatenate([pose[seen, :].reshape(-1), rest], out=inputs)
-        for call in self.calls:
+        pose = (rotations.numpy()[1:] - np.eye(3, dtype=np.float32)).reshape(-1)
+        np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
+        for call in (*self.trunk.calls, self.spread.call):
             call()
-        np.sum(self.of_limbs, axis=0, out=self.amounts)
-        self.spread.call()
         return torch.from_numpy(self.spread.outputs / np.float32(MILLI)).reshape(-1, 3)
 
 
