@@ -160,8 +160,9 @@ class DenseDecoder(nn.Module):
         super().__init__()
         self.trunk = Trunk(LATENTS, config, generator)
         self.last = _head(config.width, statistics.mean.numel(), generator)
-        self.register_buffer("middle", statistics.mean.flatten())
-        self.register_buffer("spread", statistics.spread.flatten())
+        # copies: a file refuses buffers that share memory, and those of `blank` would be filled twice
+        self.register_buffer("middle", statistics.mean.flatten().clone())
+        self.register_buffer("spread", statistics.spread.flatten().clone())
 
     def forward(self, latent: Float[Tensor, "*B L"]) -> Float[Tensor, "*B N 3"]:
         return (self.middle + self.last(self.trunk(latent)) * self.spread).unflatten(-1, (-1, 3))
