@@ -190,6 +190,15 @@ def test_round_trip_on_disk_keeps_the_garments(tmp_path):
     assert back.story == subspace.story
 
 
+def test_the_published_form_comes_back_from_disk(tmp_path):
+    data, dense = made_up_set(), replace(SMALL, rank=0)
+    subspace = Subspace("tshirt", Statistics.of(data, dense), dense)
+    subspace.save(tmp_path / "s.safetensors")
+    back = Subspace.load(tmp_path / "s.safetensors")
+    for name, tensor in subspace.named_buffers():
+        torch.testing.assert_close(dict(back.named_buffers())[name], tensor, msg=name)
+
+
 def test_wrong_garments_and_latents_are_refused():
     data = made_up_set()
     subspace = Subspace("tshirt", Statistics.of(data, SMALL), SMALL)

@@ -4,6 +4,7 @@ Three implementations of one interface, all differentiable in p: exact (BVH and 
 tabulated (adaptive grid).
 """
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,6 +72,12 @@ class LearnedSDF(BodySDF):
         centred = (points - (self.low + self.high) / 2) / ((self.high - self.low).max() / 2)
         return self.network(centred)[..., 0]
 
+    def to(self, device: torch.device) -> "LearnedSDF":
+        """Move it to a device, in place."""
+        self.low, self.high = self.low.to(device), self.high.to(device)
+        self.network.to(device)
+        return self
+
     def save(self, folder: str | Path) -> None:
         """Write sdf.safetensors (float16) into the folder."""
         save_network(self.network, Path(folder) / "sdf.safetensors", kind="sdf", fingerprint=self.fingerprint)
@@ -120,6 +127,12 @@ class GridSDF(BodySDF):
         if not bool((beyond > 0).any()):
             return within
         return within + torch.linalg.vector_norm(beyond, dim=-1)
+
+    def to(self, device: torch.device) -> "GridSDF":
+        """The same table on another device."""
+        moved = copy.copy(self)
+        moved.grid = self.grid.to(device)
+        return moved
 
     def save(self, path: str | Path) -> None:
         """Write the grid (npz)."""

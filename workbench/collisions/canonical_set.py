@@ -43,6 +43,17 @@ class CanonicalSequence:
     def __len__(self) -> int:
         return len(self.coefficients)
 
+    def to(self, device: torch.device) -> "CanonicalSequence":
+        """The same on a device."""
+        return replace(
+            self,
+            coefficients=self.coefficients.to(device),
+            rotations=self.rotations.to(device),
+            translation=self.translation.to(device),
+            betas=self.betas.to(device),
+            valid=self.valid.to(device),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class CanonicalSet:
@@ -70,6 +81,15 @@ class CanonicalSet:
     def coefficients_of(self, garments: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B R"]:
         """The coefficients nearest to X (the basis is orthogonal, of squared length N)."""
         return (garments - self.mean).flatten(-2) @ self.flat_basis.T / len(self.mean)
+
+    def to(self, device: torch.device) -> "CanonicalSet":
+        """The same on a device."""
+        return replace(
+            self,
+            mean=self.mean.to(device),
+            basis=self.basis.to(device),
+            sequences=tuple(sequence.to(device) for sequence in self.sequences),
+        )
 
     def of_split(self, split: str) -> tuple[CanonicalSequence, ...]:
         return tuple(sequence for sequence in self.sequences if sequence.split == split)

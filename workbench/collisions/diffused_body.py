@@ -352,6 +352,14 @@ class LearnedFields(DiffusedFields):
         feature = pose_coefficients @ self.lift
         return Rigging(self.weights(points), self.shape_offsets(points, betas) + self.pose_offsets(points, feature))
 
+    def to(self, device: torch.device) -> "LearnedFields":
+        """Move them to a device, in place."""
+        for name in ("pose_map", "lift", "visible", "low", "high"):
+            setattr(self, name, getattr(self, name).to(device))
+        for network in self.networks().values():
+            network.to(device)
+        return self
+
     def networks(self) -> dict[str, MLP]:
         """The three networks by the name of their checkpoint file."""
         return {"weights": self.weight_net, "shape": self.shape_net, "pose": self.pose_net}

@@ -26,6 +26,8 @@ from workbench.collisions.diffused_body import (
 )
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.geometry.sampling import sample_box, sample_shell
+from workbench.learning.batches import random_rows
+from workbench.learning.device import device_named
 from workbench.learning.fit import FitConfig, FitResult, fit
 
 log = logging.getLogger(__name__)
@@ -70,6 +72,7 @@ class TrainFieldsConfig:
     sdf_batch: int = 1024  # 1,200 such steps end 0.54 mm off on the surface, 500 of 4,096 points 0.76 mm
     sdf_points: int = 2_000_000
     seed: int = 0
+    device: str = "cpu"  # cpu, cuda, cuda:1, mps; what the networks learn from is made on the CPU first
 
     @staticmethod
     def paper_size() -> "TrainFieldsConfig":
@@ -105,6 +108,10 @@ class FieldPool:
     rows: Float[Tensor, "N C"]
     layout: FieldLayout
 
+    def to(self, device: torch.device) -> "FieldPool":
+        """The same on a device."""
+        return FieldPool(self.points.to(device), self.rows.to(device), self.layout)
+
 
 @dataclass(frozen=True)
 class DistancePool:
@@ -113,9 +120,17 @@ class DistancePool:
     points: Float[Tensor, "N 3"]
     distances: Float[Tensor, "N"]
 
+    def to(self, device: torch.device) -> "DistancePool":
+        """The same on a device."""
+        return DistancePool(self.points.to(device), self.distances.to(device))
+
 
 def run(config: TrainFieldsConfig) -> TrainedFields:
-    """Train the networks that are asked for and write each to `config.out`; continues an interrupted run."""
+    """Train the networks that are asked for and write each to `config.out`; continues an interrupted run.
+
+    What it returns is on the CPU.  Raises ValueError for a device that is not there.
+    """
+    device = device_named(config.device)
     body = Body.load(config.body) if config.body else Body.default()
     work = config.out / "work"
     fields = LearnedFields(body, generator=torch.Generator().manual_seed(config.seed))
@@ -123,6 +138,7 @@ def run(config: TrainFieldsConfig) -> TrainedFields:
     if config.start is not None:
         fields.read(config.start, only=config.networks)
         sdf = LearnedSDF.load(config.start, body) if "sdf" in config.networks else sdf
+    fields, sdf = fields.to(device), sdf.to(device)
     fits: dict[Network, FitResult] = {}
 
     def train(name: Network, network: torch.nn.Module, loss_of: Callable[[torch.Generator], Tensor]) -> None:
@@ -139,18 +155,19 @@ def run(config: TrainFieldsConfig) -> TrainedFields:
 
     @cache  # made at the first step that asks: a run that only finishes the SDF needs none
     def pool() -> FieldPool:
-        return make_pool(body, config.pool, seed=config.seed)
+        return make_pool(body, config.pool, seed=config.seed).to(device)
 
     @cache
     def distances() -> DistancePool:
-        return make_distance_pool(body, config.sdf_points, seed=config.seed)
+        return make_distance_pool(body, config.sdf_points, seed=config.seed).to(device)
 
-    poses = random_pose_features(body, 8192, seed=config.seed)
+    poses = random_pose_features(body, 8192, seed=config.seed).to(device)
     train("weights", fields.weight_net, lambda generator: weights_loss(fields, pool(), config.batch, generator))
     train("pose", fields.pose_net, lambda generator: pose_loss(fields, pool(), poses, config.batch, generator))
     train("shape", fields.shape_net, lambda generator: shape_loss(fields, pool(), config.batch, generator))
     train("sdf", sdf.network, lambda generator: sdf_loss(sdf, distances(), config.sdf_batch, generator))
-    trained = TrainedFields(fields, sdf, fits)
+    home = torch.device("cpu")
+    trained = TrainedFields(fields.to(home), sdf.to(home), fits)
     trained.save(config.out)
     log.info("trained %s", {name: asdict(result) for name, result in fits.items()})
     return trained
@@ -161,14 +178,14 @@ def run(config: TrainFieldsConfig) -> TrainedFields:
 
 def weights_loss(fields: LearnedFields, pool: FieldPool, batch: int, generator: torch.Generator) -> Tensor:
     """Mean L1 distance of W~ to Eq. 4: the figure it is judged by."""
-    index = torch.randint(len(pool.points), (batch,), generator=generator)
+    index = random_rows(pool.points, batch, generator)
     target = pool.layout.split(pool.rows[index].float()).weights
     return (fields.weights(pool.points[index]) - target).abs().sum(-1).mean()
 
 
 def shape_loss(fields: LearnedFields, pool: FieldPool, batch: int, generator: torch.Generator) -> Tensor:
     """Distance of B~s to Eq. 5, root mean square over beta ~ N(0, I), mean over points, in units of OFFSET_UNIT."""
-    index = torch.randint(len(pool.points), (batch,), generator=generator)
+    index = random_rows(pool.points, batch, generator)
     target = pool.layout.split(pool.rows[index].float()).shape_directions
     error = (fields.shape_directions(pool.points[index]) - target) / OFFSET_UNIT
     return _mean_norm(error.flatten(1))
@@ -178,8 +195,8 @@ def pose_loss(
     fields: LearnedFields, pool: FieldPool, poses: Float[Tensor, "M Q"], batch: int, generator: torch.Generator
 ) -> Tensor:
     """Mean distance of B~p to Eq. 6 at random poses, in units of OFFSET_UNIT."""
-    index = torch.randint(len(pool.points), (batch,), generator=generator)
-    feature = poses[torch.randint(len(poses), (batch,), generator=generator)]
+    index = random_rows(pool.points, batch, generator)
+    feature = poses[random_rows(poses, batch, generator)]
     directions = pool.layout.split(pool.rows[index].float()).pose_directions
     target = torch.einsum("np,npi->ni", feature @ fields.pose_map, directions)
     predicted = fields.pose_offsets(pool.points[index, None], feature)[:, 0]
@@ -188,7 +205,7 @@ def pose_loss(
 
 def sdf_loss(sdf: LearnedSDF, pool: DistancePool, batch: int, generator: torch.Generator) -> Float[Tensor, ""]:
     """Mean absolute error over (30 mm + distance): garments need tenths of a millimetre, the far field millimetres."""
-    index = torch.randint(len(pool.points), (batch,), generator=generator)
+    index = random_rows(pool.points, batch, generator)
     truth = pool.distances[index]
     return ((sdf(pool.points[index]) - truth).abs() / (0.03 + truth.abs())).mean()
 

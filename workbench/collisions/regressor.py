@@ -26,6 +26,8 @@ from workbench.collisions.motion_descriptor import (
 )
 from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace
 from workbench.garments import Garment
+from workbench.learning.batches import random_rows
+from workbench.learning.device import device_named
 from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.learning.network_file import read_network, write_network
 from workbench.learning.scalar_log import ScalarLog, read_curves
@@ -65,6 +67,7 @@ class TrainRegressorConfig:
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=2500, learning_rate=1e-3))
     watch_every: int = 500
     seed: int = 0
+    device: str = "cpu"  # cpu, cuda, cuda:1, mps; all of a step is computed there
 
 
 class Regressor(nn.Module):
@@ -203,8 +206,9 @@ class RegressorTraining:
 
     @staticmethod
     def of(config: TrainRegressorConfig) -> "RegressorTraining":
-        data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
-        subspace = Subspace.load(config.out / f"{data.garment_name}{config.suffix}-subspace.safetensors")
+        device = device_named(config.device)
+        data = (CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)).to(device)
+        subspace = Subspace.load(config.out / f"{data.garment_name}{config.suffix}-subspace.safetensors").to(device)
         for parameter in subspace.parameters():
             parameter.requires_grad_(False)
         body = Body.default()
@@ -220,7 +224,7 @@ class RegressorTraining:
             data.fps,
             torch.Generator().manual_seed(config.seed),
         )
-        return RegressorTraining(config, body, data, subspace, latents, regressor)
+        return RegressorTraining(config, body.to(device), data, subspace, latents, regressor.to(device))
 
     def windows(self, split: str, count: int, length: int, generator: torch.Generator) -> Windows:
         """`count` random windows of `length` frames (shorter sequences are repeated at their end, not kept there)."""
@@ -230,8 +234,9 @@ class RegressorTraining:
         for i in which:
             s = sequences[i]
             begin = int(torch.randint(max(1, len(s) - length + 1), (1,), generator=generator))
-            index = (begin + torch.arange(length)).clamp(max=len(s) - 1)
-            kept = s.valid[index] & (begin + torch.arange(length) < len(s))
+            frame = begin + torch.arange(length, device=s.valid.device)
+            index = frame.clamp(max=len(s) - 1)
+            kept = s.valid[index] & (frame < len(s))
             parts.append((s.rotations[index], s.translation[index], s.betas, latents[i][index], kept))
         return Windows(*(torch.stack(column) for column in zip(*parts, strict=True)))
 
@@ -246,26 +251,28 @@ class RegressorTraining:
 def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
     """theta_bar first: a small network has to read off it where the pose brings the template and the joints."""
     config, body = training.config, training.body
+    device = body.template.device
     generator = torch.Generator().manual_seed(config.seed + 3)
     template = Garment.load(training.data.garment_name).vertices
-    chosen = torch.randperm(len(template), generator=generator)[:200]
-    values = GridFields.default().at(template[chosen])
+    chosen = template[torch.randperm(len(template), generator=generator)[:200]]
+    weights, chosen = GridFields.default().at(chosen).weights.to(device), chosen.to(device)
     rotations = torch.cat([s.rotations for s in training.data.of_split("train")])
     reader = nn.Sequential(nn.Linear(POSE_SIZE, 256), nn.ReLU(), nn.Linear(256, 3 * (len(chosen) + len(body.parents))))
     for layer in (reader[0], reader[2]):
         assert isinstance(layer, nn.Linear)
         nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
         nn.init.zeros_(layer.bias)
+    reader.to(device)
 
     def loss_of(_: int, chance: torch.Generator) -> Float[Tensor, ""]:
-        index = torch.randint(len(rotations), (64,), generator=chance)
+        index = random_rows(rotations, 64, chance)
         with torch.no_grad():
             local = rotations[index].clone()
-            local[:, 0] = torch.eye(3)  # what the root does is not the pose's
+            local[:, 0] = torch.eye(3, device=device)  # what the root does is not the pose's
             posed = body.pose(local, body.mean_shape())
-            blended = torch.einsum("nj,bjik->bnik", values.weights, posed.transforms.rotation)
-            shift = torch.einsum("nj,bji->bni", values.weights, posed.transforms.translation)
-            points = torch.einsum("bnik,nk->bni", blended, template[chosen]) + shift
+            blended = torch.einsum("nj,bjik->bnik", weights, posed.transforms.rotation)
+            shift = torch.einsum("nj,bji->bni", weights, posed.transforms.translation)
+            points = torch.einsum("bnik,nk->bni", blended, chosen) + shift
             wanted = torch.cat([points, posed.joints], dim=1)
         read = reader(training.regressor.describe(rotations[index])).unflatten(-1, (-1, 3))
         return (read - wanted).norm(dim=-1).mean()
@@ -282,7 +289,10 @@ def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
 
 
 def run(config: TrainRegressorConfig) -> Regressor:
-    """Train (or continue), write `out`/GARMENT-regressor.safetensors with its curves, return it."""
+    """Train (or continue), write `out`/GARMENT-regressor.safetensors with its curves, return it, on the CPU.
+
+    Raises ValueError for a device that is not there.
+    """
     training = RegressorTraining.of(config)
     name = f"{training.data.garment_name}{config.suffix}"
     work = config.out / "work" / f"{name}-regressor"
@@ -290,7 +300,7 @@ def run(config: TrainRegressorConfig) -> Regressor:
     fit_descriptor(training, work)
     regressor.standardise(training.data.of_split("train"))
     train(training, work)
-    regressor.eval()
+    regressor.cpu().eval()
     regressor.story = {
         "config": json.loads(json.dumps(asdict(config), default=str)),
         "curves": read_curves(work / "curves.jsonl"),
@@ -329,7 +339,7 @@ def measure(training: RegressorTraining) -> dict[str, float]:
     latent_error, error, frames = 0.0, 0.0, 0
     for s, wanted in zip(training.data.of_split("validation"), training.latents["validation"], strict=True):
         found = training.regressor(s.rotations[None], s.translation[None], s.betas[None])[0]
-        pick = torch.arange(0, len(s), 12)
+        pick = torch.arange(0, len(s), 12, device=s.valid.device)
         pick = pick[s.valid[pick]]
         if not len(pick):
             continue

@@ -22,6 +22,8 @@ from workbench.collisions.body_sdf import BodySDF, GridSDF
 from workbench.collisions.canonical_set import CanonicalSet
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.learning.batches import random_rows
+from workbench.learning.device import device_named
 from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.learning.network_file import read_network, write_network
 from workbench.learning.scalar_log import ScalarLog, read_curves
@@ -76,6 +78,7 @@ class TrainSubspaceConfig:
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=6000, learning_rate=1e-3, checkpoint_every=500))
     watch_every: int = 500  # steps between two points of the curves (Fig. 4)
     seed: int = 0
+    device: str = "cpu"  # cpu, cuda, cuda:1, mps; all of a step is computed there
 
     @staticmethod
     def paper_size() -> "TrainSubspaceConfig":
@@ -160,8 +163,9 @@ class DenseDecoder(nn.Module):
         super().__init__()
         self.trunk = Trunk(LATENTS, config, generator)
         self.last = _head(config.width, statistics.mean.numel(), generator)
-        self.register_buffer("middle", statistics.mean.flatten())
-        self.register_buffer("spread", statistics.spread.flatten())
+        # copies: a file refuses buffers that share memory, and those of `blank` would be filled twice
+        self.register_buffer("middle", statistics.mean.flatten().clone())
+        self.register_buffer("spread", statistics.spread.flatten().clone())
 
     def forward(self, latent: Float[Tensor, "*B L"]) -> Float[Tensor, "*B N 3"]:
         return (self.middle + self.last(self.trunk(latent)) * self.spread).unflatten(-1, (-1, 3))
@@ -231,7 +235,7 @@ class Subspace(nn.Module):
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "B N 3"]:
         """Garments decoded from N(0, I)."""
-        return self.decode(torch.randn(count, LATENTS, generator=generator))
+        return self.decode(torch.randn(count, LATENTS, generator=generator).to(self.decoder.middle.device))
 
     def save(self, path: Path) -> None:
         """The parameters, with what made them."""
@@ -315,7 +319,7 @@ class SubspaceLoss:
     ) -> Float[Tensor, ""]:
         w = self.weights
         mean, log_variance = subspace.encoder(X)
-        noise = torch.randn(mean.shape, generator=generator)
+        noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         decoded = subspace.decode(mean + (0.5 * log_variance).exp() * noise)
         rec = reconstruction_loss(X, decoded)
         lap = laplacian_loss(X, decoded, self.laplacian)
@@ -338,30 +342,36 @@ class SubspaceTraining:
 
     @staticmethod
     def of(config: TrainSubspaceConfig) -> "SubspaceTraining":
+        """What does not depend on the device is made on the CPU, alike for all, then moved."""
+        device = device_named(config.device)
         data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
         faces = garment_faces(data)
         network = replace(config.network, rank=min(config.network.rank, data.rank))
         generator = torch.Generator().manual_seed(config.seed)
         subspace = Subspace(data.garment_name, Statistics.of(data, network), network, generator)
-        laplacian = umbrella_laplacian(faces, len(data.mean))
-        return SubspaceTraining(config, data, subspace, SubspaceLoss(GridSDF.default(), laplacian, config.weights))
+        laplacian = umbrella_laplacian(faces, len(data.mean)).to(device)
+        loss = SubspaceLoss(GridSDF.default().to(device), laplacian, config.weights)
+        return SubspaceTraining(config, data.to(device), subspace.to(device), loss)
 
     @cached_property
     def frames(self) -> Float[Tensor, "M R"]:
         return self.data.kept("train")
 
     def step(self, _: int, generator: torch.Generator) -> Float[Tensor, ""]:
-        index = torch.randint(len(self.frames), (self.config.batch,), generator=generator)
+        index = random_rows(self.frames, self.config.batch, generator)
         return self.loss(self.subspace, self.data.garments(self.frames[index]), generator, self.config.random_batch)
 
 
 def run(config: TrainSubspaceConfig) -> Subspace:
-    """Train (or continue), write `out`/GARMENT-subspace.safetensors with its curves, return it."""
+    """Train (or continue), write `out`/GARMENT-subspace.safetensors with its curves, return it, on the CPU.
+
+    Raises ValueError for a device that is not there.
+    """
     training = SubspaceTraining.of(config)
     name = f"{training.data.garment_name}{config.suffix}"
     work = config.out / "work" / f"{name}-subspace"
     train(training, work)
-    subspace = training.subspace.eval()
+    subspace = training.subspace.cpu().eval()
     subspace.story = {
         "config": _plain(config),
         "curves": read_curves(work / "curves.jsonl"),
@@ -400,7 +410,8 @@ def measure(training: SubspaceTraining, frames: int = 256, samples: int = 256) -
     collisions for garments drawn from N(0, I)."""
     generator = torch.Generator().manual_seed(17)
     unseen = training.data.kept("validation")
-    X = training.data.garments(unseen[torch.randperm(len(unseen), generator=generator)[:frames]])
+    chosen = torch.randperm(len(unseen), generator=generator)[:frames].to(unseen.device)
+    X = training.data.garments(unseen[chosen])
     decoded = training.subspace.decode(training.subspace.encode(X))
     imagined = training.subspace.sample(samples, generator)
     return {

@@ -1,7 +1,7 @@
 """Distances between point clouds: x (M,3), y (N,3) -> who is nearest to whom, and what that distance is.
 
-The search (KDTree over a Morton order, facts.md 5) is blind to gradients; distances are taken afterwards, in torch,
-so that they flow into both clouds.
+The search (KDTree over a Morton order, facts.md 5; of clouds on a GPU, all distances) is blind to gradients; distances
+are taken afterwards, in torch, so that they flow into both clouds.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from torch import Tensor
 from .closest_point import checked_points, morton_order
 
 LEAF = 24  # points a leaf of the tree; ours: 16 to 32 are equal within noise
+DISTANCES_AT_ONCE = 1 << 26  # on a GPU: 256 MB
 
 
 class NearestPoint:
@@ -46,9 +47,19 @@ class Matches:
 
 def match(x: Float[Tensor, "M 3"], y: Float[Tensor, "N 3"], *, nearest_in_y: NearestPoint | None = None) -> Matches:
     """Nearest neighbours both ways; `nearest_in_y` is the search in y where it is asked more than once."""
+    if x.device.type != "cpu" and nearest_in_y is None:
+        return Matches(nearest_by_all_distances(x, y), nearest_by_all_distances(y, x))
     x_points, y_points = x.detach().cpu().numpy(), y.detach().cpu().numpy()
     in_y = NearestPoint(y_points) if nearest_in_y is None else nearest_in_y
     return Matches(torch.from_numpy(in_y(x_points)), torch.from_numpy(NearestPoint(x_points)(y_points)))
+
+
+@torch.no_grad()
+def nearest_by_all_distances(points: Float[Tensor, "M 3"], cloud: Float[Tensor, "N 3"]) -> Int[Tensor, "M"]:
+    """The index in the cloud of the point nearest to each of `points`, in torch: where a tree cannot go, on a GPU."""
+    parts = points.split(max(1, DISTANCES_AT_ONCE // len(cloud)))
+    exact = "donot_use_mm_for_euclid_dist"  # by matrix products, a metre loses tenths of a millimetre
+    return torch.cat([torch.cdist(part, cloud, compute_mode=exact).argmin(1) for part in parts])
 
 
 def chamfer_distance(x: Float[Tensor, "M 3"], y: Float[Tensor, "N 3"], matches: Matches) -> Float[Tensor, ""]:

@@ -6,6 +6,7 @@ hence small on disk.  A node on the border to an unsplit cell keeps surplus zero
 reads the eight corners of one leaf.
 """
 
+import copy
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -118,6 +119,14 @@ class FieldGrid:
         rows = _Lookup.apply(points.reshape(-1, 3), self)
         return rows.reshape(*points.shape[:-1], self.channels)
 
+    def to(self, device: torch.device) -> "FieldGrid":
+        """The same table on another device, for points that are there."""
+        moved = copy.copy(self)
+        for name in ("child", "corner", "values", "low", "high"):
+            setattr(moved, name, getattr(self, name).to(device))
+        vars(moved).pop("_double_values", None)
+        return moved
+
     def save(self, path: str | Path) -> None:
         """Write the compact form (npz)."""
         save_compact(self.compact, path)
@@ -142,15 +151,14 @@ class FieldGrid:
         cell = (root[:, 0] * shape[1] + root[:, 1]) * shape[2] + root[:, 2]
         size = torch.full_like(local[:, 0], self.compact.root_size)
         digits = torch.tensor([4, 2, 1], device=points.device)
-        child = self.child.to(points.device).long()
         for _ in range(self.depth):
-            down = child[cell]
+            down = self.child[cell].long()
             deeper = down >= 0
             octant = (2 * local).long().clamp(max=1)
             cell = torch.where(deeper, down + (octant * digits).sum(1), cell)
             local = torch.where(deeper[:, None], 2 * local - octant, local)
             size = torch.where(deeper, size / 2, size)
-        return Leaf(self.corner.to(points.device)[cell], trilinear_weights(local), local, size)
+        return Leaf(self.corner[cell], trilinear_weights(local), local, size)
 
     def _locate_by_warp(self, points: Float[Tensor, "N 3"]) -> "Leaf":
         count = len(points)

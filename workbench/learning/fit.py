@@ -1,8 +1,8 @@
 """The one optimisation loop: parameters, a loss a step -> trained parameters, a checkpoint that resumes.
 
 A run that is killed continues from its checkpoint with the same parameters, Adam moments, step and generator state, so
-it ends where the uninterrupted run ends (bit by bit on one thread).  Under torchrun all processes take each step
-together (`parallel`).
+it ends where the uninterrupted run ends (bit by bit on one thread).  It computes where the parameters are; a checkpoint
+continues on any device.  Under torchrun all processes take each step together (`parallel`).
 """
 
 import json
@@ -68,8 +68,8 @@ def fit(
 ) -> FitResult:
     """Minimise `loss_of(step, generator)` over `parameters`, in place.
 
-    All chance of a step must come from `generator`, or a resumed run differs.  `checkpoint` (safetensors) is written
-    every `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.
+    All chance of a step must come from `generator`, a CPU one, or a resumed run differs.  `checkpoint` (safetensors) is
+    written every `checkpoint_every` steps and at the end, whole or not at all; if it exists, the run continues from it.
     `watch(step, loss)` is called after each step (logging).  Raises ValueError for a checkpoint of other parameters or
     another config, FloatingPointError when the loss is not finite.
 
@@ -123,9 +123,9 @@ def _save(
     tensors = {_chance(rank): state for rank, state in enumerate(chances)}
     for index, parameter in enumerate(parameters):
         state = optimizer.state[parameter]
-        tensors[f"parameter.{index}"] = parameter.detach().contiguous()
-        tensors[f"mean.{index}"] = state["exp_avg"].contiguous()
-        tensors[f"square.{index}"] = state["exp_avg_sq"].contiguous()
+        tensors[f"parameter.{index}"] = parameter.detach().cpu().contiguous()
+        tensors[f"mean.{index}"] = state["exp_avg"].cpu().contiguous()
+        tensors[f"square.{index}"] = state["exp_avg_sq"].cpu().contiguous()
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"step": str(step), "config": json.dumps(asdict(config), sort_keys=True)}
     with atomic_write(path) as part:
@@ -167,8 +167,8 @@ def _restore(
         parameter.data.copy_(tensors[f"parameter.{index}"])
         optimizer.state[parameter] = {
             "step": torch.tensor(float(step)),
-            "exp_avg": tensors[f"mean.{index}"],
-            "exp_avg_sq": tensors[f"square.{index}"],
+            "exp_avg": tensors[f"mean.{index}"].to(parameter.device),
+            "exp_avg_sq": tensors[f"square.{index}"].to(parameter.device),
         }
     generator.set_state(tensors[_chance(team.rank)])
     return step

@@ -37,16 +37,17 @@ def write_network(
     Under torchrun the first process writes, and all wait until it has.
     """
     tensors = {}
-    for name, tensor in network.state_dict().items():
+    for name, parameter in network.state_dict().items():
+        tensor = parameter.detach().cpu()
         if name in coarse and tensor.dim() == 2:
             first, rest = tensor[: coarse[name]], tensor[coarse[name] :]
             steps = _short(rest.abs().amax(dim=0).clamp_min(1e-30) / 127)
             tensors[name] = torch.round(rest / steps).to(torch.int8).contiguous()
             tensors[name + STEPS] = steps.contiguous()
             if len(first):
-                tensors[name + FIRST] = _compact(first.detach()).contiguous()
+                tensors[name + FIRST] = _compact(first).contiguous()
         else:
-            tensors[name] = _compact(tensor.detach()).contiguous()
+            tensors[name] = _compact(tensor).contiguous()
     team = processes()
     if team.first:
         with atomic_write(path) as part:

@@ -67,9 +67,13 @@ class Processes:
 
 
 def processes() -> Processes:
-    """Those that torchrun started, which meet at the first call; one alone without it."""
+    """Those that torchrun started, which meet at the first call; one alone without it.
+
+    What lies on GPUs is exchanged by NCCL, what lies on the CPU (all generators) by gloo.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return Processes()
     if not group.is_initialized():
-        group.init_process_group("gloo")
+        with_gpus = torch.cuda.is_available() and group.is_nccl_available()
+        group.init_process_group("cpu:gloo,cuda:nccl" if with_gpus else "gloo")
     return Processes(group.get_rank(), group.get_world_size())

@@ -65,7 +65,7 @@ class Dresser:
     def __call__(self, bodies: PosedBodies) -> ClothedPoints:
         """Clothes on bodies in the pelvis frame, frame by frame."""
         image = self._atlas.map_of(bodies.neutral)
-        with autocast(self.precision):
+        with autocast(self.precision, image.device):
             pose = self.model.encoder(image).float()
         frames = [self._decode(P[None]) for P in pose]
         canonical = CanonicalClothes(

@@ -53,7 +53,7 @@ class PatchModel(nn.Module):
 
     def penalised(self) -> Float[Tensor, "1 1 1 1"]:
         """There is no G: the term of Eq. 6 is zero."""
-        return torch.zeros(1, 1, 1, 1)
+        return next(self.parameters()).new_zeros(1, 1, 1, 1)
 
     def forward(
         self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
@@ -68,7 +68,7 @@ class PatchModel(nn.Module):
 
     def decode(self, features: Float[Tensor, "B c H W"], posed: PosedQueries, side: int) -> ClothedPoints:
         """`side` x `side` points a patch."""
-        grid = patch_grid(side)
+        grid = patch_grid(side).to(posed.u.device)
         pixel = pixel_of(posed.u, features.shape[-1])
         z = features.flatten(-2)[..., pixel].mT.float()  # of the nearest pixel: constant within the patch
         B, N, k = len(z), z.shape[1], len(grid)

@@ -120,13 +120,13 @@ def fit_scan(
     image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
     model.eval().requires_grad_(False)
     try:
-        with torch.no_grad(), autocast(config.precision):
+        with torch.no_grad(), autocast(config.precision, image.device):
             pose = model.encoder(image).float()
         G = model.geometry.mean()[None].clone().requires_grad_()
 
         def terms_at(asked: SurfaceQueries, seen: ScanFrame) -> LossTerms:
             posed = posed_queries(asked, bodies)
-            with autocast(config.precision):
+            with autocast(config.precision, image.device):
                 canonical = model.decode(asked.u, pose, model.geometry.smooth(G))
             cloud = clothed(posed, canonical)
             x, n_x = cloud.points[0], cloud.normals[0]

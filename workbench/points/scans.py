@@ -30,6 +30,10 @@ class ScanFrame:
     points: Float[Tensor, "N 3"]
     normals: Float[Tensor, "N 3"]
 
+    def to(self, device: torch.device) -> "ScanFrame":
+        """The same on a device."""
+        return ScanFrame(self.points.to(device), self.normals.to(device))
+
 
 @dataclass(frozen=True, eq=False)
 class ScanSequence:

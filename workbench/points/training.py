@@ -98,19 +98,28 @@ def papers_training(frames: int) -> PointTrainingConfig:
 
 @dataclass(frozen=True, eq=False)
 class ScanSet:
-    """The frames of many sequences, counted through, on one body model."""
+    """The frames of many sequences, counted through, on one body model.
+
+    Scans stay on the CPU, packed as they are stored; all else of a batch is made on `device`.
+    """
 
     body: Body
     scans: tuple[ScanSequence, ...]
     outfits: tuple[str, ...]
     input_size: int = INPUT_SIZE
+    device: torch.device = torch.device("cpu")
 
     @staticmethod
-    def of(body: Body, scans: Sequence[ScanSequence], input_size: int = INPUT_SIZE) -> "ScanSet":
+    def of(
+        body: Body,
+        scans: Sequence[ScanSequence],
+        input_size: int = INPUT_SIZE,
+        device: torch.device = torch.device("cpu"),
+    ) -> "ScanSet":
         """Raises ValueError where there is nothing to learn from."""
         if not scans:
             raise ValueError("there are no scans to learn from; make some with `python -m assets_gen scans`")
-        return ScanSet(body, tuple(scans), outfits_of(scans), input_size)
+        return ScanSet(body, tuple(scans), outfits_of(scans), input_size, device)
 
     @cached_property
     def places(self) -> tuple[tuple[int, int], ...]:
@@ -119,7 +128,11 @@ class ScanSet:
 
     @cached_property
     def atlas(self) -> Atlas:
-        return atlas_of(self.body, self.input_size)
+        return atlas_of(self.body, self.input_size).to(self.device)
+
+    @cached_property
+    def body_there(self) -> Body:
+        return self.body.to(self.device)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -129,11 +142,12 @@ class ScanSet:
         chosen = [self.places[i] for i in index]
         sequences = [self.scans[k] for k, _ in chosen]
         rotations = torch.stack([scan.rotations[t] for scan, (_, t) in zip(sequences, chosen, strict=True)])
-        bodies = posed_bodies(self.body, rotations, torch.stack([scan.betas for scan in sequences]))
+        betas = torch.stack([scan.betas for scan in sequences])
+        bodies = posed_bodies(self.body_there, rotations.to(self.device), betas.to(self.device))
         return Batch(
             bodies=bodies,
             position_map=self.atlas.map_of(bodies.neutral),
-            outfit=torch.tensor([self.outfits.index(scan.outfit) for scan in sequences]),
+            outfit=torch.tensor([self.outfits.index(scan.outfit) for scan in sequences], device=self.device),
             scans=[scan.frame(t) for scan, (_, t) in zip(sequences, chosen, strict=True)],
         )
 
@@ -182,9 +196,10 @@ def train_points(
 ) -> FitResult:
     """Minimise Eq. 3 over all parameters of the model, in place, then settle BatchNorm; resumes from `checkpoint`.
 
-    `queries`: the points to draw from (default: the pixels of the query map).  All chance comes from the config's seed.
+    The model is on the scan set's device.  `queries`: the points to draw from (default: the pixels of the query map).
+    All chance comes from the config's seed.
     """
-    places = atlas_of(scans.body, config.query_size).queries if queries is None else queries
+    places = (atlas_of(scans.body, config.query_size).queries if queries is None else queries).to(scans.device)
 
     def loss_of(step: int, generator: torch.Generator) -> Tensor:
         return step_loss(model, scans, places, config, step, generator)
@@ -214,7 +229,7 @@ def step_loss(
 ) -> Float[Tensor, ""]:
     """Eq. 3 on frames, pixels and scan points drawn from `generator`."""
     batch, posed = _drawn(scans, places, config, generator)
-    with autocast(config.precision):
+    with autocast(config.precision, scans.device):
         cloud = model(batch.position_map, batch.outfit, posed)
     return cloud_terms(cloud, batch.scans, model.penalised()).total(weights_at(step, config))
 
@@ -237,9 +252,9 @@ def settle(model: ClothesModel, scans: ScanSet, places: SurfaceQueries, config: 
     _train_mode(model, training=False)
 
 
-def autocast(precision: Precision) -> torch.autocast:
+def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     """Networks in half precision where asked for."""
-    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bfloat16")
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16")
 
 
 def _drawn(
@@ -248,8 +263,9 @@ def _drawn(
     batch = scans.batch(torch.randint(len(scans), (config.batch,), generator=generator).tolist())
     asked = places
     if config.queries < len(places):
-        asked = places.subset(torch.randperm(len(places), generator=generator)[: config.queries])
-    thinned = [thin(scan, config.scan_points, generator) for scan in batch.scans]
+        index = torch.randperm(len(places), generator=generator)[: config.queries]
+        asked = places.subset(index.to(scans.device))
+    thinned = [thin(scan, config.scan_points, generator).to(scans.device) for scan in batch.scans]
     return Batch(batch.bodies, batch.position_map, batch.outfit, thinned), posed_queries(asked, batch.bodies)
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 
 from workbench.body.model import Body
+from workbench.learning.device import device_named
 from workbench.learning.scalar_log import ScalarLog, read_curves
 from workbench.points.clothed_points import PointModel, PointModelConfig
 from workbench.points.geometry_features import GeometryFeaturesConfig
@@ -64,22 +65,26 @@ class TrainPointsConfig:
     # Learn from every n-th frame: 2, 4 and 8 are the halves, quarters and eighths of Tab. 2.
     every: int = 1
     training: PointTrainingConfig = PointTrainingConfig()
+    # cpu, cuda, cuda:1 or mps; scans are unpacked and thinned on the CPU, all else of a step is computed there.
+    device: str = "cpu"
 
 
 def run(config: TrainPointsConfig) -> tuple[Path, ...]:
     """Train (or continue); returns the model files: `out`/METHOD[-everyN][-OUTFIT].safetensors.
 
-    Raises ValueError for a folder without scans, outfits that it lacks, or a step count of a run that differs.
+    Raises ValueError for a folder without scans, outfits that it lacks, a step count of a run that differs, or a device
+    that is not there.
     """
+    device = device_named(config.device)
     body = Body.default()
     scans = chosen(load_scans(training_folder(config.data)), config)
     name = config.method if config.every == 1 else f"{config.method}-every{config.every}"
     if not (config.per_outfit or config.method == "patches"):
-        return (train_one(scans, config, body, name),)
+        return (train_one(scans, config, body, device, name),)
     written = []
     for outfit in outfits_of(scans):
         own = [scan for scan in scans if scan.outfit == outfit]
-        written.append(train_one(own, config, body, f"{name}-{outfit}"))
+        written.append(train_one(own, config, body, device, f"{name}-{outfit}"))
     return tuple(written)
 
 
@@ -107,12 +112,14 @@ def chosen(scans: Sequence[ScanSequence], config: TrainPointsConfig) -> list[Sca
     return [scan.every(config.every) for scan in kept]
 
 
-def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Body, name: str) -> Path:
+def train_one(
+    scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Body, device: torch.device, name: str
+) -> Path:
     """One model, with its curves beside the checkpoint in `out`/work/NAME and in the model file."""
     patches = config.method == "patches"
     sizes = PointModelConfig() if config.paper else TWO_CORES
     size = TWO_CORES_PATCHES.size if patches else sizes.input_size
-    frames = ScanSet.of(body, scans, size)
+    frames = ScanSet.of(body, scans, size, device)
     training = papers_training(len(frames)) if config.paper else config.training
     generator = torch.Generator().manual_seed(training.seed)
     if patches:
@@ -124,6 +131,7 @@ def train_one(scans: Sequence[ScanSequence], config: TrainPointsConfig, body: Bo
         if config.start is not None:
             begin_with(TrainedPoints.load(config.start, body), model, frames.outfits)
         places = None
+    model.to(device)
     work = config.out / "work" / name
     log.info("%s: %d scans of %s", name, len(frames), ", ".join(frames.outfits))
     curves = Curves(work, training.fit.checkpoint_every)

@@ -36,6 +36,10 @@ class SurfaceQueries:
     def subset(self, index: Int[Tensor, " M"]) -> "SurfaceQueries":
         return SurfaceQueries(self.u[index], self.corners[index], self.barycentric[index])
 
+    def to(self, device: torch.device) -> "SurfaceQueries":
+        """The same on a device."""
+        return SurfaceQueries(self.u.to(device), self.corners.to(device), self.barycentric.to(device))
+
     def interpolate(self, attributes: Float[Tensor, "*B V c"]) -> Float[Tensor, "*B N c"]:
         """Attributes of the body's vertices at the points (p_i, T_i: barycentric, so continuous)."""
         gathered = attributes[..., self.corners.reshape(-1), :].unflatten(-2, self.corners.shape)
@@ -49,6 +53,10 @@ class Atlas:
     size: int
     pixel: Int[Tensor, " N"]  # row * size + column
     queries: SurfaceQueries
+
+    def to(self, device: torch.device) -> "Atlas":
+        """The same on a device."""
+        return Atlas(self.size, self.pixel.to(device), self.queries.to(device))
 
     def map_of(self, attributes: Float[Tensor, "*B V c"]) -> Float[Tensor, "*B c H W"]:
         """Vertex attributes as images; zero where there is no body."""
