@@ -17,7 +17,8 @@ The map
 | training set        | 4.4     |      | workbench.collisions.canonical_set | X (T,N,3) of many sequences <-> file |
 | subspace            | 4.4     | 13-16 | workbench.collisions.subspace   | X -> x_bar (25) -> X                 |
 | motion descriptor   | 5       | 17   | workbench.collisions.motion_descriptor | theta, H, K -> gamma (42)      |
-| posed collisions    |         |      | workbench.collisions.posed_collision | X, beta, theta -> hinge of depth |
+| posed distance      |         |      | workbench.collisions.posed_distance | X, beta, theta -> signed distance |
+| contact planes      |         |      | workbench.collisions.contact_planes | poses, C -> distances, linear in C |
 | regressor           | 5       | 1, 18 | workbench.collisions.regressor  | beta, gamma -> x_bar (T,25)          |
 | posed corrective    |         |      | workbench.collisions.posed_corrective | theta, beta, x_bar -> offset of X |
 | try-on              | 5-6     |      | workbench.collisions.tryon       | beta, motion -> posed garment        |

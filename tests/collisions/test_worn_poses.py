@@ -2,8 +2,12 @@
 
 import torch
 
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.regressor import Regressor
-from workbench.collisions.worn_poses import SHAPE_CUT, Wearer, WornPoses
+from workbench.collisions.worn_poses import SHAPE_CUT, Wearer, WornPoses, with_room
+from workbench.garments import Garment
+from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.motion import Motion
 
 
@@ -51,3 +55,29 @@ def test_sets_are_joined_in_their_order(body):
     both = WornPoses.joined(parts)
     assert len(both) == 5
     torch.testing.assert_close(both[torch.arange(2, 5)].latents, parts[1].latents)
+
+
+def test_motions_are_worn_as_they_are_on_one_shape(body, tmp_path):
+    wear, motion = wearer(body, tmp_path), still(body, "a")
+    motion.rotations[:, body.joint_names.index("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 1.4, 0.0]))
+    worn = wear.uncleared([motion])
+    torch.testing.assert_close(worn.rotations, motion.rotations[::4])
+    torch.testing.assert_close(worn.betas, wear.shapes_of(motion)[:1].expand(2, -1))
+
+
+def test_poses_stay_that_leave_cloth_room_and_the_fewer_the_more_it_needs(body):
+    """An arm nears the flank until it is in it."""
+    angles = torch.linspace(0.2, 1.4, 13)
+    rotations = body.rest_rotations()[None].repeat(len(angles), 1, 1, 1)
+    arm = body.joint_names.index("LeftArm")
+    rotations[:, arm] = axis_angle_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]))
+    worn = WornPoses(rotations, torch.zeros(len(angles), body.shape_count), torch.zeros(len(angles), 25))
+    model, shirt = GarmentModel(body, GridFields.default()), Garment.load("tshirt").vertices
+
+    def cloth(some: WornPoses) -> torch.Tensor:
+        return model.posed(shirt.expand(len(some), -1, -1), model.state(some.rotations, some.betas))
+
+    kept = [with_room(worn, cloth, body, gap) for gap in (0.0, 0.01, 0.02)]
+    assert len(angles) > len(kept[0]) > len(kept[1]) > len(kept[2]) > 0
+    for some in kept:
+        torch.testing.assert_close(some.rotations, worn.rotations[: len(some)])

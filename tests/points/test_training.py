@@ -109,8 +109,8 @@ def test_half_precision_learns_alike(scans, small_model):
 
 def test_normals_join_late():
     config = config_of(steps=100, normals_from=0.3)
-    assert weights_at(29, config).normal == 1e-6
-    assert weights_at(30, config).normal == 1.0
+    assert weights_at(29, config).normal == config.weights.normal * config.normals_before
+    assert weights_at(30, config).normal == config.weights.normal
     assert weights_at(29, config).distance == weights_at(30, config).distance == 1e4
 
 

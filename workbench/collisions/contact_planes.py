@@ -2,7 +2,7 @@
 
 To look where a posed garment touches takes 20 ms; a network's step over what was seen takes 1 ms.  So many garments are
 looked at once, each vertex keeps the plane of the skin nearest to it, and many steps are taken before they are looked
-at anew.  That the fields at X are held fixed makes the posed vertex linear in C already (`posed_collision`).
+at anew.  That the fields at X are held fixed makes the posed vertex linear in C already (`posed_distance`).
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from workbench.collisions.body_sdf import BodySDF
-from workbench.collisions.posed_collision import PosedCollision
+from workbench.collisions.posed_distance import PosedDistance
 from workbench.collisions.worn_poses import WornPoses
 
 MILLI = 1e3
@@ -45,7 +45,7 @@ class ContactPlanes:
         worn: WornPoses,
         decode: Callable[[Tensor], Tensor],
         corrective: Callable[[Tensor, Tensor, Tensor], Tensor],
-        posed: PosedCollision,
+        distance: PosedDistance,
         sdf: BodySDF,
     ) -> "ContactPlanes":
         """Look at garments as they are corrected now."""
@@ -55,7 +55,7 @@ class ContactPlanes:
             with torch.no_grad():
                 offset = corrective(w.rotations, w.betas, w.latents)
                 corrected = decode(w.latents) + offset
-            of_body = _plane(lambda X, w=w: posed.distance_of(X, w.rotations, w.betas), corrected, offset)
+            of_body = _plane(lambda X, w=w: distance.of(X, w.rotations, w.betas), corrected, offset)
             parts.append((of_body, _plane(sdf, corrected, offset)))
         both = [torch.cat(of_one) for of_one in zip(*parts, strict=True)]
         return ContactPlanes(worn, *both)

@@ -3,7 +3,7 @@
 Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
 touches nothing ends inside the posed body (facts.md 9).  25 latents cannot say where: pushing the regressor's own
 output (tried before) took a third of the collisions off and cost 2.4 mm of vertex error.  This network adds an offset
-C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `PosedCollision` alone, on training motions worn by
+C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `ContactPlanes` alone, on training motions worn by
 random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on
 C and on its Laplacian keeps it away from where it is not needed.
 """
@@ -11,7 +11,7 @@ C and on its Laplacian keeps it away from where it is not needed.
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF, GridSDF
 from workbench.collisions.canonical_set import CanonicalSet
+from workbench.collisions.contact_planes import ContactPlanes
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
-from workbench.collisions.penetration import penetration
-from workbench.collisions.posed_collision import PosedCollision
+from workbench.collisions.posed_distance import PosedDistance
 from workbench.collisions.regressor import Regressor
-from workbench.collisions.subspace import LATENTS, Subspace, collision_loss
-from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses
+from workbench.collisions.subspace import LATENTS, Subspace
+from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses, with_room
 from workbench.formats import load_motion, motion_files
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
@@ -45,8 +45,7 @@ FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections r
 # Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
 # a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
 MOVES = 0.05
-MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself: beyond, nothing can be learned
-LOOKED_AT = 4  # for which one vertex in so many is looked at
+ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
 FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
 
 
@@ -59,11 +58,6 @@ class CorrectiveWeights:
     # |C|^2: square, so that no vertex goes far.  On validation motions 0.547 % are inside without C, error 19.1 mm;
     # after 600 steps 0.05 left 0.381 % and 18.8 mm, 0.012 0.179 % and 19.0 mm; |C|_1 x 0.15 left 0.055 % and 23.5 mm.
     size: float = 0.003
-    # |C|^2 again, of vertices that stand farther off the body than any collision asks for: 0.03 took the T-shirt's mean
-    # offset on validation motions from 6.8 to 4.1 mm, and left 0.076 instead of 0.061 % inside
-    needless: float = 0.0
-    needed_to: float = 6e-3  # metres off the posed body, up to which it does not count ...
-    needless_from: float = 16e-3  # ... and from which it counts in full
     laplacian: float = 0.5  # |Delta C|_1
     posed_clearance: float = 3e-3  # metres
     canonical_clearance: float = 2e-3  # metres, epsilon of Eq. 16
@@ -80,6 +74,8 @@ class TrainCorrectiveConfig:
     out: Path = Path("out/models")
     # Folders of further motion files to learn from: no garment was ever simulated on them, and none need be.
     motions: tuple[Path, ...] = ()
+    # The same, but not cleared: those of their poses are learned from that leave cloth room.
+    uncleared: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
     rank: int = 96
@@ -89,9 +85,10 @@ class TrainCorrectiveConfig:
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
-    batch: int = 8  # frames a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=5000, learning_rate=2e-3, clip_norm=50.0))
-    watch_every: int = 400
+    round_poses: int = 4000  # jittered poses whose contacts are looked at ...
+    round_steps: int = 800  # ... and learned from for so many steps
+    batch: int = 32  # poses a step
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=12_000, learning_rate=2e-3, clip_norm=50.0))
     seed: int = 0
 
 
@@ -206,8 +203,8 @@ class CorrectiveTraining:
         return CorrectiveTraining(config, data, subspace, regressor, model, GridSDF.default(), start)
 
     @cached_property
-    def posed(self) -> PosedCollision:
-        return PosedCollision(self.model, clearance=self.config.weights.posed_clearance)
+    def distance(self) -> PosedDistance:
+        return PosedDistance(self.model)
 
     @cached_property
     def laplacian(self) -> Float[Tensor, "N N"]:
@@ -221,29 +218,29 @@ class CorrectiveTraining:
         return [joint for joint in range(1, len(moves)) if not (moves[joint] or moves[body.parents[joint]])]
 
     def wear(self, split: str) -> WornPoses:
-        """The motions of a split on random shapes; training also takes those of `motions`."""
+        """The motions of a split on random shapes; training also takes those of `motions` and `uncleared`."""
         config, body, fps = self.config, self.model.body, self.data.fps
         motions = [
             Motion(s.rotations, s.translation, fps, body.skeleton, s.motion_name) for s in self.data.of_split(split)
         ]
         if split == "train":
-            motions += [load_motion(file, body) for folder in config.motions for file in motion_files(folder)]
+            motions += _motions_in(config.motions, body)
         seed = config.seed + {"train": 3, "validation": 5}[split]
         kept = config.out / "work" / "cleared"
-        worn = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)(motions)
-        return self.free(worn)
+        wearer = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)
+        worn = with_room(wearer(motions), self.garments, body)
+        if split == "train" and config.uncleared:
+            loose = wearer.uncleared(_motions_in(config.uncleared, body))
+            worn = WornPoses.joined([worn, with_room(loose, self.garments, body, ROOM)])
+        return worn
 
-    @torch.no_grad()
-    def free(self, worn: WornPoses) -> WornPoses:
-        """Without the poses in which the body overlaps itself where the garment hangs: no garment lives there."""
-        free = []
-        for part in torch.arange(len(worn)).split(64):
-            some = worn[part]
-            posed = self.model.posed(self.subspace.decode(some.latents), self.model.state(some.rotations, some.betas))
-            bodies = self.model.body.vertices(some.rotations, some.betas)
-            overlap = penetration(bodies, self.model.body.faces, posed[:, ::LOOKED_AT]).overlap.float().mean(dim=1)
-            free.append(some[torch.nonzero(overlap <= MOST_OVERLAP)[:, 0]])
-        return WornPoses.joined(free)
+    def garments(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
+        """Posed, as the regressor alone has them."""
+        return self.model.posed(self.subspace.decode(worn.latents), self.model.state(worn.rotations, worn.betas))
+
+    def contacts(self, corrective: PosedCorrective, worn: WornPoses) -> ContactPlanes:
+        """What the garments touch, as they are corrected now."""
+        return ContactPlanes.of(worn, self.subspace.decode, corrective, self.distance, self.sdf)
 
     def needed(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
         """What would bring each vertex that is too near to the clearance: A^T (c - d) n, in canonical space."""
@@ -252,9 +249,9 @@ class CorrectiveTraining:
             local = self.model.local_map(X, self.model.state(worn.rotations, worn.betas))
             bodies = self.model.body.vertices(worn.rotations, worn.betas)
         posed = local.posed(X).requires_grad_(True)
-        distance = self.posed.distance(posed, bodies)
+        distance = self.distance.between(posed, bodies)
         (away,) = torch.autograd.grad(distance.sum(), posed)
-        short = (self.posed.clearance - distance.detach()).clamp_min(0.0)
+        short = (self.config.weights.posed_clearance - distance.detach()).clamp_min(0.0)
         return (local.rotation.mT @ (short[..., None] * away)[..., None])[..., 0]
 
     def first_basis(self, worn: WornPoses) -> Float[Tensor, "R N3"]:
@@ -275,24 +272,16 @@ class CorrectiveTraining:
         sizes = (self.data.garment_name, len(body.parents), body.shape_count)
         return PosedCorrective(*sizes, basis, config.width, torch.Generator().manual_seed(config.seed))
 
-    def loss(self, corrective: PosedCorrective, worn: WornPoses) -> Float[Tensor, ""]:
+    def loss(self, corrective: PosedCorrective, contacts: ContactPlanes) -> Float[Tensor, ""]:
         """The terms of `CorrectiveWeights`, of one batch."""
-        w = self.config.weights
-        with torch.no_grad():
-            X = self.subspace.decode(worn.latents)
-        offset = corrective(worn.rotations, worn.betas, worn.latents)
-        corrected = X + offset
-        distance = self.posed.distance_of(corrected, worn.rotations, worn.betas)
-        hinge = self.posed.shortfall(distance)
-        canonical = collision_loss(self.sdf, corrected, w.canonical_clearance)
-        squares = MILLI**2 * offset.square().sum(-1)
-        room = ((distance.detach() - w.needed_to) / (w.needless_from - w.needed_to)).clamp(0.0, 1.0)
-        rough = MILLI * apply_laplacian(self.laplacian, offset).abs().mean()
+        w, worn = self.config.weights, contacts.worn
+        offset = MILLI * corrective(worn.rotations, worn.betas, worn.latents)
+        posed, canonical = contacts.distances(offset)
+        hinge = (MILLI * w.posed_clearance - posed).clamp_min(0.0).mean()
+        of_template = (MILLI * w.canonical_clearance - canonical).clamp_min(0.0).mean()
+        rough = apply_laplacian(self.laplacian, offset).abs().mean()
         return (
-            w.hinge * hinge
-            + w.canonical * canonical
-            + ((w.size + w.needless * room) * squares).mean()
-            + w.laplacian * rough
+            w.hinge * hinge + w.canonical * of_template + w.size * offset.square().sum(-1).mean() + w.laplacian * rough
         )
 
     @torch.no_grad()
@@ -306,13 +295,17 @@ class CorrectiveTraining:
             bodies = self.model.body.vertices(some.rotations, some.betas)
             state = self.model.state(some.rotations, some.betas)
             for found, shape in ((before, X), (after, X + offset)):
-                found.append((self.posed.distance(self.model.posed(shape, state), bodies) < 0).float().mean(1))
+                found.append((self.distance.between(self.model.posed(shape, state), bodies) < 0).float().mean(1))
             size.append(MILLI * offset.norm(dim=-1).mean(1))
         return {
             "validation inside without, %": 100 * float(torch.cat(before).mean()),
             "validation inside, %": 100 * float(torch.cat(after).mean()),
             "validation size, mm": float(torch.cat(size).mean()),
         }
+
+
+def _motions_in(folders: Sequence[Path], body: Body) -> list[Motion]:
+    return [load_motion(file, body) for folder in folders for file in motion_files(folder)]
 
 
 def _check_start(start: PosedCorrective, garment_name: str, body: Body, path: Path) -> None:
@@ -342,21 +335,28 @@ def train(training: CorrectiveTraining, worn: Mapping[str, WornPoses], work: Pat
     corrective = training.begin(worn["train"])
     corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
+    contacts: list[ContactPlanes] = []  # of the round
 
-    def loss_of(_: int, generator: torch.Generator) -> Float[Tensor, ""]:
-        index = torch.randint(len(worn["train"]), (config.batch,), generator=generator)
-        return training.loss(corrective, worn["train"][index].jittered(config.jitter, generator))
+    def look(generator: torch.Generator) -> ContactPlanes:
+        index = torch.randint(len(worn["train"]), (config.round_poses,), generator=generator)
+        return training.contacts(corrective, worn["train"][index].jittered(config.jitter, generator))
+
+    def loss_of(step: int, generator: torch.Generator) -> Float[Tensor, ""]:
+        if step % config.round_steps == 0:
+            contacts[:] = [look(generator)]
+        index = torch.randint(config.round_poses, (config.batch,), generator=generator)
+        return training.loss(corrective, contacts[0][index])
 
     def watch(step: int, loss: float) -> None:
         if not curves:
             curves.append(ScalarLog(work, begin=step + 1))
-        if (step + 1) % config.watch_every == 0 or step + 1 == config.fit.steps:
+        if (step + 1) % config.round_steps == 0 or step + 1 == config.fit.steps:
             curves[0].add(step + 1, {"loss": loss, **training.measure(corrective, worn["validation"])})
 
     fit(
         list(corrective.parameters()),
         loss_of,
-        config.fit,
+        replace(config.fit, checkpoint_every=config.round_steps),  # a run that continues looks anew, and sees the same
         generator=torch.Generator().manual_seed(config.seed + 2),
         checkpoint=work / "checkpoint.safetensors",
         label=f"corrective of {name}",

@@ -1,10 +1,11 @@
 """What a corrective learns from: motions, chance -> poses cleared for random shapes, with the regressor's latents.
 
 Clearing takes seconds a motion and does not depend on the garment: each cleared motion is kept, named by what made it.
+Motions need not be cleared where there are many of them: those of their poses are taken that leave cloth room.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +16,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from workbench.body.model import Body
+from workbench.collisions.penetration import penetration
 from workbench.collisions.regressor import Regressor
+from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.motion import Motion
 from workbench.store import Store, code_version
 
 SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
+MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself: beyond, nothing can be learned
+LOOKED_AT = 4  # for which one vertex in so many is looked at
 
 
 @dataclass(frozen=True)
@@ -90,18 +95,41 @@ class Wearer:
             made = pool.map(lambda pair: self.worn(*pair), worn)
             return WornPoses.joined(list(tqdm(made, total=len(worn), desc="clear for random shapes", mininterval=5.0)))
 
+    def uncleared(self, motions: Sequence[Motion]) -> WornPoses:
+        """Every motion as it is, on the first of its shapes."""
+        made = (self.dressed(motion, self.shapes_of(motion)[0]) for motion in motions)
+        return WornPoses.joined(list(tqdm(made, total=len(motions), desc="dress uncleared motions", mininterval=5.0)))
+
     def shapes_of(self, motion: Motion) -> Float[Tensor, "S K"]:
         """The shapes that wear a motion: the same for every garment."""
         generator = torch.Generator().manual_seed(self.seed + zlib.crc32(motion.name.encode()))
         return torch.randn(self.shapes, self.body.shape_count, generator=generator).clamp(-SHAPE_CUT, SHAPE_CUT)
 
-    @torch.no_grad()
     def worn(self, motion: Motion, betas: Float[Tensor, " K"]) -> WornPoses:
-        """One motion on one shape."""
-        motion = cleared_for(motion, betas, self.body, Store(self.kept))
+        """One motion on one shape, cleared for it."""
+        return self.dressed(cleared_for(motion, betas, self.body, Store(self.kept)), betas)
+
+    @torch.no_grad()
+    def dressed(self, motion: Motion, betas: Float[Tensor, " K"]) -> WornPoses:
         latents = self.regressor(motion.rotations[None], motion.translation[None], betas[None])[0]
         index = torch.arange(0, len(motion), self.every)
         return WornPoses(motion.rotations[index], betas.expand(len(index), -1), latents[index])
+
+
+@torch.no_grad()
+def with_room(
+    worn: WornPoses, garments: Callable[[WornPoses], Float[Tensor, "B N 3"]], body: Body, gap: float = 0.0
+) -> WornPoses:
+    """The poses in which the body keeps `gap` metres from itself where the garment hangs, and does not overlap."""
+    free = []
+    for part in torch.arange(len(worn)).split(64):
+        some = worn[part]
+        bodies = body.vertices(some.rotations, some.betas)
+        if gap:
+            bodies = bodies + gap / 2 * vertex_normals(bodies, body.faces)
+        overlap = penetration(bodies, body.faces, garments(some)[:, ::LOOKED_AT]).overlap.float().mean(dim=1)
+        free.append(some[torch.nonzero(overlap <= MOST_OVERLAP)[:, 0]])
+    return WornPoses.joined(free)
 
 
 def cleared_for(motion: Motion, betas: Float[Tensor, " K"], body: Body, store: Store) -> Motion:

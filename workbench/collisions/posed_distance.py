@@ -1,10 +1,10 @@
-"""Beyond the paper: collisions in POSED space, without ground truth.  X (B,N,3), theta, beta -> hinge of the depth.
+"""Beyond the paper: how far garments are off the POSED body.  X (B,N,3), theta, beta -> signed distance (B,N).
 
 Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
-touches nothing can end inside the posed body (facts.md 9).  This term poses garments on random shapes and motions and
-pushes what is inside, or nearer than a clearance, out along the way to the closest point of the posed body.
+touches nothing can end inside the posed body (facts.md 9).  The gradient of this distance is the way out.
 
-The fields at X are held fixed in the gradient (as in fixed-point unskinning, which shows that it is good enough).
+It is differentiable; the fields at X are held fixed in the gradient (as in fixed-point unskinning, which shows that
+it is good enough).
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,16 @@ from workbench.geometry.closest_point import ClosestPoint
 from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.winding import InsideTest
 
-MILLI = 1e3
 # Cosine between the way to a point and the surface normal there.  Above it no winding number is asked: a third of the
 # time (15 against 45 ms a frame), 0.00 to 0.10 % of the signs wrong on three test sequences.  Evaluation is exact.
 SURELY_OUTSIDE = 0.5
 
 
 @dataclass(frozen=True)
-class PosedCollision:
-    """`PosedCollision(model)(X, rotations, betas)`: mean over vertices of max(clearance - d, 0), millimetres."""
+class PosedDistance:
+    """`PosedDistance(model).of(X, rotations, betas)`, metres."""
 
     model: GarmentModel
-    clearance: float = 2e-3  # metres
     reach: float = 0.04  # metres: deeper than this the closest surface is not the way out
 
     @cached_property
@@ -44,26 +42,17 @@ class PosedCollision:
         body = self.model.body
         return InsideTest(body.template.numpy(), body.faces.numpy())
 
-    def __call__(
-        self, X: Float[Tensor, "B N 3"], rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "B K"]
-    ) -> Float[Tensor, ""]:
-        return self.shortfall(self.distance_of(X, rotations, betas))
-
-    def distance_of(
+    def of(
         self, X: Float[Tensor, "B N 3"], rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "B K"]
     ) -> Float[Tensor, "B N"]:
-        """Signed distance of canonical garments to the bodies that wear them, as `distance`."""
+        """Of canonical garments to the bodies that wear them."""
         with torch.no_grad():
             state = self.model.state(rotations, betas)
             local = self.model.local_map(X.detach(), state)
             bodies = self.model.body.vertices(rotations, betas)
-        return self.distance(local.posed(X), bodies)
+        return self.between(local.posed(X), bodies)
 
-    def shortfall(self, distance: Float[Tensor, "B N"]) -> Float[Tensor, ""]:
-        """Mean over vertices of max(clearance - d, 0), millimetres."""
-        return MILLI * (self.clearance - distance).clamp_min(0.0).mean()
-
-    def distance(self, posed: Float[Tensor, "B N 3"], bodies: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N"]:
+    def between(self, posed: Float[Tensor, "B N 3"], bodies: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N"]:
         """Signed distance to each body, differentiable in the points; beyond `reach` it says `reach`, constant."""
         values = torch.full(posed.shape[:-1], self.reach)
         directions = torch.zeros_like(posed)
