@@ -2,7 +2,8 @@
 
 A choreography shares a bend among the joints of the spine, lets the clavicle follow the arm and keeps feet planted.
 People, and the skeletons that motion capture is put on, share otherwise: here every joint that moves a garment wanders
-by itself about what the motion asks of it.
+by itself about what the motion asks of it, and in half of the motions one joint has the bend of the whole spine, as on
+skeletons that have no other.
 """
 
 from dataclasses import replace
@@ -15,23 +16,25 @@ from workbench.motion import Motion
 
 # Degrees of (flexion, abduction, twist) to either side, ours.  Hips bend to a deep crouch, which no family reaches.
 AMPLITUDES = {
-    "LowerBack": (20, 12, 12),
-    "Spine": (14, 10, 10),
-    "Spine1": (14, 10, 10),
+    "LowerBack": (24, 20, 16),
+    "Spine": (20, 20, 14),
+    "Spine1": (20, 20, 14),
     "Neck": (16, 12, 15),
     "Neck1": (14, 10, 12),
     "Head": (12, 10, 12),
     "Shoulder": (14, 14, 2),
     "Arm": (30, 30, 40),
     "ForeArm": (35, 2, 40),
-    "UpLeg": (55, 20, 25),
+    "UpLeg": (70, 20, 25),
     "Leg": (45, 0, 0),
 }
+SPINE = ("LowerBack", "Spine", "Spine1")
 RATE = 0.6  # Hz: the fastest a joint wanders
 
 
 def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
-    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS.
+    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS; then, or not, the spine's bend
+    gathered in its lowest joint.
 
     Feet slide and may sink: for networks that see theta alone.
     """
@@ -47,4 +50,15 @@ def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
         allowed = torch.tensor([limit.flexion, limit.abduction, limit.twist], dtype=torch.float64)
         meant = torch.clamp(usual + torch.from_numpy(added), allowed[:, 0], allowed[:, 1])
         rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
-    return replace(motion, rotations=rotations, name=f"{motion.name}_loose")
+    loose = replace(motion, rotations=rotations, name=f"{motion.name}_loose")
+    return gathered(loose) if rng.random() < 0.5 else loose
+
+
+def gathered(motion: Motion) -> Motion:
+    """The same with the whole bend of the spine in its lowest joint."""
+    rotations = motion.rotations.clone()
+    lowest, *others = (motion.skeleton.index(joint) for joint in SPINE)
+    for other in others:  # from the hips up, as they are chained
+        rotations[:, lowest] = rotations[:, lowest] @ rotations[:, other]
+        rotations[:, other] = torch.eye(3)
+    return replace(motion, rotations=rotations)

@@ -3,14 +3,14 @@
 import numpy as np
 import torch
 
-from assets_gen.loose_motions import AMPLITUDES, loosened
+from assets_gen.loose_motions import AMPLITUDES, SPINE, gathered, loosened
 from assets_gen.motions import beyond_limits, generate, joint_angles, limit_of
 from workbench.motion import Motion
 
 
 def test_joints_wander_within_their_limits_and_others_stay(body):
     motion = generate("dance_03", body.skeleton, frames=40)
-    loose = loosened(motion, np.random.default_rng(1))
+    loose = loosened(motion, np.random.default_rng(3))  # a chance that leaves the spine in its joints
     assert float(beyond_limits(loose).max()) < 0.1
     before, after = joint_angles(motion), joint_angles(loose)
     for joint, usual in before.items():
@@ -21,6 +21,28 @@ def test_joints_wander_within_their_limits_and_others_stay(body):
         elif min(np.diff(limit_of(joint).flexion)) > 0:
             assert float(moved.max()) > 1, joint
     assert loose.name == "dance_03_loose"
+
+
+def test_a_gathered_spine_bends_as_it_did_in_one_joint(body):
+    motion = generate("dance_03", body.skeleton, frames=10)
+    lowest, middle, highest = (motion.skeleton.index(joint) for joint in SPINE)
+    whole = motion.rotations[:, lowest] @ motion.rotations[:, middle] @ motion.rotations[:, highest]
+    found = gathered(motion)
+    torch.testing.assert_close(found.rotations[:, lowest], whole)
+    for other in (middle, highest):
+        torch.testing.assert_close(found.rotations[:, other], torch.eye(3).expand(10, 3, 3))
+    limbs = [index for index in range(len(motion.skeleton.names)) if index not in (lowest, middle, highest)]
+    torch.testing.assert_close(found.rotations[:, limbs], motion.rotations[:, limbs])
+
+
+def test_some_spines_are_gathered_and_some_are_not(body):
+    motion = generate("walk_02", body.skeleton, frames=2)
+    middle = motion.skeleton.index(SPINE[1])
+    still = [
+        torch.equal(loosened(motion, np.random.default_rng(seed)).rotations[:, middle], torch.eye(3).expand(2, 3, 3))
+        for seed in range(12)
+    ]
+    assert any(still) and not all(still)
 
 
 def test_the_same_chance_gives_the_same_motion_and_it_stays_smooth(body):
