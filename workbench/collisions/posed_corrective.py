@@ -78,10 +78,10 @@ class TrainCorrectiveConfig:
     uncleared: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
-    rank: int = 96
-    width: int = 512
-    weights: CorrectiveWeights = CorrectiveWeights()
-    jitter: Jitter = Jitter()
+    rank: int = 96  # offsets that are mixed
+    width: int = 512  # of the layers that say how much of each
+    weights: CorrectiveWeights = CorrectiveWeights()  # of the terms of the loss
+    jitter: Jitter = Jitter()  # what is added to poses, shapes and latents, at every look
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
