@@ -13,6 +13,7 @@ from workbench.collisions.posed_corrective import (
     PosedCorrective,
     TrainCorrectiveConfig,
     run,
+    train,
 )
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
@@ -217,6 +218,12 @@ def test_uncleared_motions_are_worn_where_they_leave_room(config, body, tmp_path
     )
     assert len(more) - len(plain) == -(-6 // config.every)
     torch.testing.assert_close(more.rotations[-1], rotations[0])
+
+
+def test_motions_without_room_for_the_garment_are_refused(config, body, tmp_path):
+    training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
+    with pytest.raises(ValueError, match="no pose of the train motions leaves room for the tshirt"):
+        train(training, {"train": worn[torch.arange(0)], "validation": worn}, tmp_path)
 
 
 def test_an_interrupted_training_ends_like_a_whole_one(config, tmp_path):

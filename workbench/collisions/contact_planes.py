@@ -1,8 +1,8 @@
 """Beyond the paper: contact as planes.  worn poses, C -> distances of every vertex to skin, to first order in C.
 
-To look where a posed garment touches takes 20 ms; a network's step over what was seen takes 1 ms.  So many garments are
-looked at once, each vertex keeps the plane of the skin nearest to it, and many steps are taken before they are looked
-at anew.  That the fields at X are held fixed makes the posed vertex linear in C already (`posed_distance`).
+To look where a posed garment touches takes 20 ms; its share of a network's step over what was seen takes 0.6 ms.  So
+many garments are looked at, each vertex keeps the plane of the skin nearest to it, and many steps are taken before they
+are looked at anew.  That the fields at X are held fixed makes the posed vertex linear in C already (`posed_distance`).
 """
 
 from collections.abc import Callable

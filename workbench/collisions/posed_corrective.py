@@ -32,6 +32,7 @@ from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses, with_room
 from workbench.formats import load_motion, motion_files
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.learning.batches import random_rows
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.network_file import read_network, write_network
 from workbench.learning.scalar_log import ScalarLog, read_curves
@@ -332,19 +333,22 @@ def run(config: TrainCorrectiveConfig) -> PosedCorrective:
 def train(training: CorrectiveTraining, worn: Mapping[str, WornPoses], work: Path) -> PosedCorrective:
     """Learn from worn["train"], watch on worn["validation"]; state and curves lie in `work`."""
     config, name = training.config, training.data.garment_name
+    for split, poses in worn.items():
+        if not len(poses):
+            raise ValueError(f"no pose of the {split} motions leaves room for the {name}; take others")
     corrective = training.begin(worn["train"])
     corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
     contacts: list[ContactPlanes] = []  # of the round
 
     def look(generator: torch.Generator) -> ContactPlanes:
-        index = torch.randint(len(worn["train"]), (config.round_poses,), generator=generator)
+        index = random_rows(worn["train"].rotations, config.round_poses, generator)
         return training.contacts(corrective, worn["train"][index].jittered(config.jitter, generator))
 
     def loss_of(step: int, generator: torch.Generator) -> Float[Tensor, ""]:
         if step % config.round_steps == 0:
             contacts[:] = [look(generator)]
-        index = torch.randint(config.round_poses, (config.batch,), generator=generator)
+        index = random_rows(contacts[0].posed, config.batch, generator)
         return training.loss(corrective, contacts[0][index])
 
     def watch(step: int, loss: float) -> None:
