@@ -3,6 +3,7 @@
 import json
 import shutil
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,13 @@ import numpy as np
 import torch
 
 from assets_gen.dataset import LIVELY
-from assets_gen.loose_motions import loosened
+from assets_gen.loose_motions import lifted, loosened
 from assets_gen.motions import FAMILIES, generate
 from workbench.body.model import Body
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet, Projected, compact
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
-from workbench.collisions.posed_corrective import TrainCorrectiveConfig
+from workbench.collisions.posed_corrective import CorrectiveWeights, TrainCorrectiveConfig
 from workbench.collisions.posed_corrective import run as train_corrective
 from workbench.collisions.projection_baselines import constant_weights
 from workbench.collisions.regressor import TrainRegressorConfig
@@ -25,6 +26,7 @@ from workbench.collisions.regressor import run as train_regressor
 from workbench.collisions.subspace import LossWeights, TrainSubspaceConfig
 from workbench.collisions.subspace import run as train_subspace
 from workbench.garments import Garment
+from workbench.motion import Motion
 from workbench.store import add_to_manifest, code_version
 
 CODE = (
@@ -37,8 +39,11 @@ CODE = (
     "workbench.collisions.worn_poses",
     "workbench.learning.fit",
 )
-LOOSE_FROM, LOOSE_FRAMES = 100, 60
+LOOSE_FROM, LIFTED_FROM, LOOSE_FRAMES = 100, 300, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
+STAGES = ("subspace", "regressor", "corrective")
+# |C|^2 of garments that hang far off the body: vertices that are moved for nothing cost more than they save
+SIZE_WEIGHTS = {"dress": 0.014}
 # Tab. 1: what each row leaves out of Eq. 13
 ABLATIONS = {
     ".unsupervised": LossWeights(self_supervised=False),
@@ -65,6 +70,10 @@ class ModelsConfig:
     """the same of the family that covers pose space most widely"""
     loose: int = 60
     """loosened motions of each training family, not cleared, that only the corrective sees"""
+    lifted: int = 4
+    """the same with knees drawn up, cleared"""
+    stages: tuple[str, ...] = STAGES
+    """what to train; of the others the networks in `out` are taken"""
 
 
 def run(config: ModelsConfig) -> None:
@@ -74,16 +83,36 @@ def run(config: ModelsConfig) -> None:
             ablation(config, suffix)
         return
     here: dict[str, Any] = {"garment": config.garment, "out": config.work}
-    unsimulated: dict[str, Any] = {"motions": (further_motions(config),)}
-    if config.loose:
-        unsimulated["uncleared"] = (loose_motions(config),)
-    stories = {
-        "subspace": train_subspace(replace(config.subspace, **here)).story,
-        "regressor": train_regressor(replace(config.regressor, **here)).story,
-        "corrective": train_corrective(replace(config.corrective, **unsimulated, **here)).story,
-    }
+    stories: dict[str, Any] = {}
+    _take_ready(config)
+    if "subspace" in config.stages:
+        stories["subspace"] = train_subspace(replace(config.subspace, **here)).story
+    if "regressor" in config.stages:
+        stories["regressor"] = train_regressor(replace(config.regressor, **here)).story
+    if "corrective" in config.stages:
+        motions = (further_motions(config), *([lifted_motions(config)] if config.lifted else []))
+        uncleared = (loose_motions(config),) if config.loose else ()
+        weights = config.corrective.weights
+        if weights == CorrectiveWeights():
+            weights = replace(weights, size=SIZE_WEIGHTS.get(config.garment, weights.size))
+        learned = replace(config.corrective, motions=motions, uncleared=uncleared, weights=weights, **here)
+        stories["corrective"] = train_corrective(learned).story
     for stage, story in stories.items():
         _record(config, f"{config.garment}-{stage}.safetensors", story)
+
+
+def _take_ready(config: ModelsConfig) -> None:
+    """The networks that later stages build on, where they are not trained: copied from `out` into `work`."""
+    unknown = sorted(set(config.stages) - set(STAGES))
+    if unknown or not config.stages:
+        raise ValueError(f"there is no stage {', '.join(unknown) or 'to train'}; there are {', '.join(STAGES)}")
+    config.work.mkdir(parents=True, exist_ok=True)
+    for stage in STAGES[: max(STAGES.index(stage) for stage in config.stages)]:
+        if stage not in config.stages:
+            ready = config.out / f"{config.garment}-{stage}.safetensors"
+            if not ready.is_file():
+                raise ValueError(f"{ready} is not there; train it as well (--stages {' '.join(STAGES)})")
+            shutil.copyfile(ready, config.work / ready.name)
 
 
 def further_motions(config: ModelsConfig) -> Path:
@@ -99,12 +128,21 @@ def further_motions(config: ModelsConfig) -> Path:
 
 def loose_motions(config: ModelsConfig) -> Path:
     """A folder of motions of the training families, short, whose joints go their own ways."""
-    folder, skeleton = config.work / "work" / "loose", Body.default().skeleton
+    return _wandering(config.work / "work" / "loose", loosened, range(LOOSE_FROM, LOOSE_FROM + config.loose))
+
+
+def lifted_motions(config: ModelsConfig) -> Path:
+    """The same with knees drawn up."""
+    return _wandering(config.work / "work" / "lifted", lifted, range(LIFTED_FROM, LIFTED_FROM + config.lifted))
+
+
+def _wandering(folder: Path, changed: Callable[[Motion, np.random.Generator], Motion], indices: Sequence[int]) -> Path:
+    skeleton = Body.default().skeleton
     folder.mkdir(parents=True, exist_ok=True)
     for family in (name for name, family in FAMILIES.items() if family.split == "train"):
-        for index in range(LOOSE_FROM, LOOSE_FROM + config.loose):
+        for index in indices:
             motion = generate(f"{family}_{index}", skeleton, frames=LOOSE_FRAMES)
-            motion = loosened(motion, np.random.default_rng([index, zlib.crc32(family.encode())]))
+            motion = changed(motion, np.random.default_rng([index, zlib.crc32(family.encode())]))
             motion.save(folder / f"{motion.name}.npz")
     return folder
 
@@ -150,7 +188,7 @@ def _record(config: ModelsConfig, file: str, story: dict[str, Any]) -> None:
     add_to_manifest(
         config.out.parent / "manifest.json",
         target,
-        command=f"python -m assets_gen models --garment {config.garment}",
+        command=f"python -m assets_gen models --garment {config.garment} --stages {' '.join(config.stages)}",
         config=json.loads(json.dumps(story["config"], default=str)),
         seed=story["config"]["seed"],
         code=code_version(*CODE),

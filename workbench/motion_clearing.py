@@ -10,9 +10,9 @@ d_i is the signed distance of sample i of the limb to the posed mesh of everythi
 of the real triangles) and linearised; each round solves the convex piecewise quadratic program by active sets on a
 banded matrix.  c_i is the clearance, less where limb and body are neighbours already in the rest pose: near armpit
 and crotch.
-Legs come first (each gives way to the other), then arms (to torso, head, legs and each other).
+Legs come first (each gives way to torso, head and the other), then arms (to torso, head, legs and each other).
 
-Not handled: a forearm in its own upper arm, a thigh in the belly, the head in a shoulder.
+Not handled: a forearm in its own upper arm, a shank in its own thigh, the head in a shoulder.
 """
 
 import logging
@@ -54,7 +54,7 @@ NAMES = (
 )
 LIMBS = ("left arm", "right arm", "left leg", "right leg")
 REACH = 0.15  # metres: what is farther off is not looked at
-PAIR_REACH = 0.05  # the same between two limbs, beyond the contact distance
+PAIR_REACH = 0.05  # the same between two limbs and between legs and torso, beyond the contact distance
 FINGERS = 2.0  # samples are this much denser on the hand, where the surface is most curved
 DOUBTFUL_DEPTH = 0.01  # metres inside from which vertex normals are not believed: ours, measured
 CHUNK = 32  # frames posed at once: bounds the memory
@@ -65,11 +65,14 @@ class ClearingConfig:
     """How far limbs stay off the body, and how smoothly they give way."""
 
     clearance: float = 0.030  # metres, arms to torso and legs: facts 9
-    contact: float = 0.008  # metres, arm to arm and head, leg to leg: ours, contact resolved with room for a cloth
+    # metres, arm to arm and head, leg to leg and torso: ours, contact resolved with room for a cloth
+    contact: float = 0.008
     near: float = 0.05  # metres to the body in rest pose up to which an arm's sample is exempt (armpit): ours
     far: float = 0.12  # and from which it owes the whole clearance; linear in between
     leg_near: float = 0.03  # the same between the legs (crotch)
     leg_far: float = 0.08
+    groin_near: float = 0.10  # the same between a leg and the torso, where every deep bend folds skin on skin
+    groin_far: float = 0.18
     smoothing: float = 0.08  # seconds tau: giving way starts about 4 tau before contact: ours, see the strips
     margin: float = 0.002  # metres aimed at beyond what is owed, against the gaps between samples
     tolerance: float = 0.001  # metres short of what is owed that still count as clear
@@ -82,7 +85,7 @@ class ClearingConfig:
     damping: float = 1.0  # rad^-2: weight of a round's change beside |x|^2, against overshooting
     settled: float = 0.03  # radians: clear and changing by less than this ends the rounds
     most_arm: float = 75.0  # degrees about one axis; what would need more stays and is reported: ours
-    most_leg: float = 30.0
+    most_leg: float = 45.0
     meeting_gap: int = 6  # frames apart up to which two contacts of the same limbs are one meeting
 
 
@@ -200,7 +203,7 @@ class Limb:
 
 @dataclass(frozen=True)
 class Core:
-    """What arms must avoid and cannot move."""
+    """What limbs must avoid and cannot move: for arms the rest of the body, for legs torso and head."""
 
     part: Part
     surface: Surface
@@ -230,7 +233,8 @@ class Rows:
 def clear(
     motion: Motion, body: Body, betas: Float[Tensor, "K"] | None = None, config: ClearingConfig = ClearingConfig()
 ) -> Motion:
-    """The nearest motion that keeps the arms off the body and limbs out of each other; see `clear_and_report`."""
+    """The nearest motion that keeps arms off the body, limbs out of each other and legs out of the torso; see
+    `clear_and_report`."""
     return clear_and_report(motion, body, betas, config).motion
 
 
@@ -245,8 +249,8 @@ def clear_and_report(
     """
     betas = body.mean_shape() if betas is None else betas
     _check(motion, body, betas)
-    legs, arms, core = _limbs(body, betas, config)
-    leg_stage = Stage(body, betas, motion.fps, legs, None, config)
+    legs, arms, torso, core = _limbs(body, betas, config)
+    leg_stage = Stage(body, betas, motion.fps, legs, torso, config)
     after_legs, leg_added, leg_before, leg_after = leg_stage.solve(motion.rotations)
     arm_stage = Stage(body, betas, motion.fps, arms, core, config)
     rotations, arm_added, arm_before, arm_after = arm_stage.solve(after_legs)
@@ -280,7 +284,7 @@ class State:
 
 
 class Stage:
-    """Two limbs that give way together: arms (with a core that does not move) or legs."""
+    """Two limbs that give way together, arms or legs, to each other and to a core that does not move."""
 
     def __init__(
         self,
@@ -288,7 +292,7 @@ class Stage:
         betas: Float[Tensor, "K"],
         fps: float,
         limbs: tuple[Limb, Limb],
-        core: Core | None,
+        core: Core,
         config: ClearingConfig,
     ):
         self.body, self.betas, self.limbs, self.core, self.config = body, betas, limbs, core, config
@@ -297,7 +301,9 @@ class Stage:
         self.meshes: dict[int, ClosestPoint] = {}  # one a part, moved from frame to frame
         self.use(tuple(np.arange(len(limb.by_root)) for limb in limbs))
         self.freedoms = 3 if limbs[0].hinge is None else 4
-        self.most = np.deg2rad(config.most_leg if core is None else config.most_arm)
+        legs = limbs[0].hinge is None
+        self.most = np.deg2rad(config.most_leg if legs else config.most_arm)
+        self.reach = config.contact + PAIR_REACH if legs else REACH  # of the core: how far off it is looked at
 
     def solve(self, rotations: Float[Tensor, "T J 3 3"]) -> tuple[Tensor, np.ndarray, State, State]:
         """(rotations, degrees added (T,2), state before, state after).
@@ -417,10 +423,9 @@ class Stage:
                 for k, limb in enumerate(self.working)
             ]
             turns = pose.transforms.rotation.numpy()
-            if self.core is not None:
-                if fresh or start not in self.still:
-                    self.still[start] = self.core.surface.points.posed(pose, coefficients).numpy()
-                found.append(self._core_rows(chunk, samples, self.core, self.still[start], levers, turns))
+            if fresh or start not in self.still:
+                self.still[start] = self.core.surface.points.posed(pose, coefficients).numpy()
+            found.append(self._core_rows(chunk, samples, self.still[start], levers, turns))
             close = np.flatnonzero(_boxes_meet(samples[0], samples[1], self.config.contact + 2 * PAIR_REACH))
             if len(close):
                 near = Pose(
@@ -437,17 +442,17 @@ class Stage:
         self,
         frames: Int[np.ndarray, "S"],
         samples: Sequence[np.ndarray],
-        core: Core,
         still: Float[np.ndarray, "S V 3"],
         levers: Sequence["Levers"],
         turns: Float[np.ndarray, "S J 3 3"],
     ) -> Rows:
         """Samples of both limbs against what does not give way."""
-        first = samples[0].shape[1]
+        core, first = self.core, samples[0].shape[1]
         owed_trunk = np.concatenate([limb.owed_to_trunk for limb in self.working])
         owed_head = np.concatenate([limb.owed_to_head for limb in self.working])
-        owes = np.broadcast_to(owed_trunk > 0, (len(frames), len(owed_trunk)))
-        hit = _signed(core.part, core.surface, still, np.concatenate(samples, axis=1), owes, turns, self.meshes)
+        cloud = np.concatenate(samples, axis=1)
+        owes = _in_box(cloud, still, self.reach) & (owed_trunk > 0)
+        hit = _signed(core.part, core.surface, still, cloud, owes, turns, self.meshes)
         head = core.head_faces[hit.face]
         gradient = np.zeros((len(hit.face), 2 * self.freedoms))
         for k, limb in enumerate(self.working):
@@ -481,9 +486,7 @@ class Stage:
     ) -> Rows:
         """Samples of limb k against the other limb's mesh, which gives way too, at the `close` frames of the chunk."""
         limb, other = self.working[k], self.working[1 - k]
-        reach = self.config.contact + PAIR_REACH
-        low, high = surface.min(1, keepdims=True) - reach, surface.max(1, keepdims=True) + reach
-        near = ((samples > low) & (samples < high)).all(2) & (limb.owed_to_other > 0)
+        near = _in_box(samples, surface, self.config.contact + PAIR_REACH) & (limb.owed_to_other > 0)
         hit = _signed(other.part, other.surface, surface, samples, near, turns[close], self.meshes)
         hit = replace(hit, frame=close[hit.frame])
         owed = limb.owed_to_other[hit.sample]
@@ -513,6 +516,14 @@ class Stage:
             whole=np.zeros(len(owed), bool),
             exit=leave,
         )
+
+
+def _in_box(
+    points: Float[np.ndarray, "S N 3"], cloud: Float[np.ndarray, "S M 3"], reach: float
+) -> Bool[np.ndarray, "S N"]:
+    """Points in the bounding box of a cloud, or no farther than `reach` from it along any axis."""
+    low, high = cloud.min(1, keepdims=True) - reach, cloud.max(1, keepdims=True) + reach
+    return ((points > low) & (points < high)).all(2)
 
 
 def _boxes_meet(
@@ -773,7 +784,7 @@ def _smooth_rotation_matrix(T: int, D: int, smoothness: float) -> Float[np.ndarr
 
 
 def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tuple:
-    """(legs, arms, core) of a body shape."""
+    """(legs, arms, what legs avoid, what arms avoid) of a body shape."""
     skeleton = body.skeleton
     names = next((scheme for scheme in NAMES if scheme["left arm"][0] in skeleton.names), None)
     if names is None:
@@ -786,25 +797,31 @@ def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tup
     belongs = {part: torch.isin(owner, joints) for part, joints in carried.items()}
     rest = body.template + body.shape_offsets(betas)
     parts = {part: closed_part(body.faces, belongs[part]) for part in LIMBS}
-    core_part = closed_part(body.faces, ~(belongs["left arm"] | belongs["right arm"]))
-    core = Core(core_part, _surface(body, rest, core_part), _faces_of(core_part, belongs["head"]))
-    still = ClosestPoint(core_part.with_centres(rest.numpy()), core_part.faces)
+    armless = ~(belongs["left arm"] | belongs["right arm"])
+    torso, core = (
+        Core(part, _surface(body, rest, part), _faces_of(part, belongs["head"]))
+        for part in (
+            closed_part(body.faces, armless & ~(belongs["left leg"] | belongs["right leg"])),
+            closed_part(body.faces, armless),
+        )
+    )
 
-    def limb(name: str, other: str) -> Limb:
+    def limb(name: str, other: str, still: Part) -> Limb:
         root, hinge = (None if joint is None else skeleton.index(joint) for joint in names[name])
         assert root is not None
         own = np.flatnonzero(belongs[name].numpy())
         points = rest[own].numpy()
         other_part = parts[other]
-        apart = ClosestPoint(other_part.with_centres(rest.numpy()), other_part.faces)
+        apart, off = (
+            ClosestPoint(p.with_centres(rest.numpy()), p.faces).query(points).distance for p in (other_part, still)
+        )
         if hinge is None:
-            to_trunk = to_head = np.zeros(len(own))
-            to_other = _owed(apart.query(points).distance, config.contact, config.leg_near, config.leg_far)
+            to_trunk = to_head = _owed(off, config.contact, config.groin_near, config.groin_far)
+            to_other = _owed(apart, config.contact, config.leg_near, config.leg_far)
         else:
-            off = still.query(points).distance
             to_trunk = _owed(off, config.clearance, config.near, config.far)
             to_head = _owed(off, config.contact, config.near, config.far)
-            to_other = _owed(apart.query(points).distance, config.contact, config.near, config.far)
+            to_other = _owed(apart, config.contact, config.near, config.far)
         cloud = points
         if hinge is not None:
             end = skeleton.children(hinge)[0]
@@ -831,9 +848,9 @@ def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tup
             surface_by_hinge=parts[name].with_centres(by_hinge),
         )
 
-    legs = (limb("left leg", "right leg"), limb("right leg", "left leg"))
-    arms = (limb("left arm", "right arm"), limb("right arm", "left arm"))
-    return legs, arms, core
+    legs = (limb("left leg", "right leg", torso.part), limb("right leg", "left leg", torso.part))
+    arms = (limb("left arm", "right arm", core.part), limb("right arm", "left arm", core.part))
+    return legs, arms, torso, core
 
 
 def _owed(distance_in_rest: Float[np.ndarray, "N"], clearance: float, near: float, far: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from assets_gen.loose_motions import AMPLITUDES, SPINE, gathered, loosened
+from assets_gen.loose_motions import AMPLITUDES, LIFTED, SPINE, gathered, lifted, loosened
 from assets_gen.motions import beyond_limits, generate, joint_angles, limit_of
 from workbench.motion import Motion
 
@@ -56,3 +56,22 @@ def fastest(motion: Motion) -> float:
     """The largest turn of a joint from one frame to the next."""
     step = motion.rotations[:-1].mT @ motion.rotations[1:]
     return float(torch.arccos(((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).max())
+
+
+def test_lifted_knees_are_drawn_up_and_all_else_is_as_loosened(body):
+    motion = generate("walk_02", body.skeleton, frames=20)
+    for seed in range(6):
+        high = lifted(motion, np.random.default_rng(seed))
+        angles = joint_angles(high)
+        raised = [
+            side
+            for side in ("Left", "Right")
+            if all(float(angles[side + joint][:, 0].min()) >= low - 0.1 for joint, (low, _) in LIFTED.items())
+        ]
+        assert raised
+        loose = loosened(motion, np.random.default_rng(seed))
+        changed = (high.rotations != loose.rotations).flatten(2).any(2).any(0)
+        assert {motion.skeleton.names[k] for k in torch.nonzero(changed)[:, 0].tolist()} == {
+            side + joint for side in raised for joint in LIFTED
+        }
+    assert high.name == "walk_02_lifted"

@@ -86,10 +86,10 @@ class TrainCorrectiveConfig:
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
-    round_poses: int = 4000  # jittered poses whose contacts are looked at ...
+    round_poses: int = 2000  # jittered poses whose contacts are looked at ...
     round_steps: int = 800  # ... and learned from for so many steps
     batch: int = 32  # poses a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=12_000, learning_rate=2e-3, clip_norm=50.0))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=24_000, learning_rate=2e-3, clip_norm=50.0))
     seed: int = 0
 
 
