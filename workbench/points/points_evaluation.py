@@ -18,6 +18,7 @@ from workbench.body.model import Body
 from workbench.evaluation_table import Row, at_least, at_most, told
 from workbench.points.clothed_points import ClothedPoints, PointModel, PointModelConfig
 from workbench.points.dressing import Dresser
+from workbench.points.equal_time import after_equal_time
 from workbench.points.evaluation import (
     CloudError,
     cloud_error,
@@ -32,7 +33,7 @@ from workbench.points.scan_fitting import ScanFitConfig, features_of, fit_scan, 
 from workbench.points.scans import ScanSequence, load_scans
 from workbench.points.trained_points import TrainedPatches, TrainedPoints
 from workbench.points.training import Batch, PointTrainingConfig, ScanSet, papers_training, step_loss
-from workbench.points.training_run import shipped_scans
+from workbench.points.training_run import shipped_scans, training_folder
 from workbench.points.uv_position_map import atlas_of, posed_queries
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,8 @@ class PointsEvaluation:
     long_fit: bool = False
     # A step of the paper's training takes a minute.
     paper_step: bool = True
+    # Train the published way and ours from chance for so many seconds each, and compare the loss; 0 leaves it out.
+    equal_seconds: float = 0.0
     repeats: int = 3
     # Steps of a fit (Eq. 7); the default is that of `workbench fit`.
     fit_steps: int = ScanFitConfig().fit.steps
@@ -310,6 +313,22 @@ def speed_rows(
         told("training step of 4 frames, paper-sized, all pixels, float32", theirs, "CPU-s"),
         told("training step of 4 frames, ours for two cores", ours, "CPU-s"),
         at_least("training step: how much faster", theirs / ours, "x", 8),
+        *(equal_time_rows(body, config) if config.equal_seconds else _left_out("training for equal seconds")),
+    ]
+
+
+def equal_time_rows(body: Body, config: PointsEvaluation) -> list[Row]:
+    """On the scans beside the test scans, or those that ship."""
+    scans = load_scans(training_folder(config.data))
+    theirs, ours = after_equal_time(scans, body, config.equal_seconds, config.seed)
+    return [
+        told("equal time: the published training", theirs.seconds, "s wall"),
+        told("equal time: its steps", theirs.steps, ""),
+        told("equal time: its loss (Eq. 3, published weights)", theirs.loss, ""),
+        told("equal time: ours for two cores", ours.seconds, "s wall"),
+        told("equal time: our steps", ours.steps, ""),
+        told("equal time: our loss", ours.loss, ""),
+        at_most("equal time: our loss / the published training's", ours.loss / theirs.loss, "", 1),
     ]
 
 
