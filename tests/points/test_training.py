@@ -12,6 +12,7 @@ from workbench.points.scans import ScanFrame, ScanSequence
 from workbench.points.training import (
     PointTrainingConfig,
     ScanSet,
+    looked_at,
     papers_training,
     thin,
     train_points,
@@ -112,6 +113,32 @@ def test_normals_join_late():
     assert weights_at(29, config).normal == config.weights.normal * config.normals_before
     assert weights_at(30, config).normal == config.weights.normal
     assert weights_at(29, config).distance == weights_at(30, config).distance == 1e4
+
+
+def test_the_end_of_a_run_looks_at_more():
+    config = config_of(steps=100, dense_from=0.8, dense=2.5)
+    assert looked_at(79, config) == config
+    late = looked_at(80, config)
+    assert (late.queries, late.scan_points) == (1000, 3750)
+    assert looked_at(10**6, papers_training(100)).queries == papers_training(100).queries
+
+
+def test_only_the_encoder_sees_the_turns(scans):
+    """What the encoder is shown is the body turned so; scan, points and frames T are those of the true pose."""
+    none = torch.eye(3).expand(2, len(scans.body.parents), 3, 3)
+    vectors = torch.zeros(2, len(scans.body.parents), 3)
+    vectors[:, scans.body.skeleton.index("LeftArm")] = 0.3
+    plain, same, turned = (
+        scans.batch([0, 4]),
+        scans.batch([0, 4], none),
+        scans.batch([0, 4], axis_angle_to_matrix(vectors)),
+    )
+    torch.testing.assert_close(same.position_map, plain.position_map, atol=1e-6, rtol=0)
+    assert (turned.position_map - plain.position_map).norm(dim=1).max() > 0.02  # metres
+    for batch in (same, turned):
+        assert torch.equal(batch.bodies.vertices, plain.bodies.vertices)
+        assert torch.equal(batch.bodies.transforms, plain.bodies.transforms)
+        assert torch.equal(batch.scans[1].points, plain.scans[1].points)
 
 
 def test_thinning_is_a_subset(rng):

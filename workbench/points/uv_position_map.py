@@ -140,15 +140,27 @@ class PosedQueries:
 
 def posed_bodies(body: Body, rotations: Float[Tensor, "B J 3 3"], betas: Float[Tensor, "*B K"]) -> PosedBodies:
     """Bodies of shape beta in pose theta, and the neutral shape in the same pose."""
-    local = rotations.clone()
-    local[:, 0] = without_heading(rotations[:, 0])
-    own, mean = body.pose(local, betas), body.pose(local, body.mean_shape())
+    local = _tilted(rotations)
+    own = body.pose(local, betas)
     transforms, _ = blended_affine(body.weights, own.transforms)
     return PosedBodies(
-        neutral=body.vertices(local, body.mean_shape()) - mean.joints[..., :1, :],
+        neutral=neutral_bodies(body, rotations),
         vertices=body.vertices(local, betas) - own.joints[..., :1, :],
         transforms=transforms,
     )
+
+
+def neutral_bodies(body: Body, rotations: Float[Tensor, "B J 3 3"]) -> Float[Tensor, "B V 3"]:
+    """The mean shape in these poses, in the pelvis frame: what a pose encoder sees."""
+    local, mean = _tilted(rotations), body.mean_shape()
+    return body.vertices(local, mean) - body.pose(local, mean).joints[..., :1, :]
+
+
+def _tilted(rotations: Float[Tensor, "B J 3 3"]) -> Float[Tensor, "B J 3 3"]:
+    """The pose without its heading."""
+    local = rotations.clone()
+    local[:, 0] = without_heading(rotations[:, 0])
+    return local
 
 
 def posed_queries(queries: SurfaceQueries, bodies: PosedBodies) -> PosedQueries:
