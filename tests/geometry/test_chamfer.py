@@ -22,6 +22,17 @@ def test_nearest_points_are_those_of_brute_force(clouds):
     torch.testing.assert_close(chamfer_distance(x, y, found), expected)
 
 
+def test_some_rows_are_looked_at_from_one_side_only(clouds):
+    """Every x finds its nearest in all of y; only the rows that are asked for look back."""
+    x, y = clouds
+    rows = torch.tensor([5, 3, 800])
+    whole, some = match(x, y), match(x, y, rows=rows)
+    assert torch.equal(some.of_x, whole.of_x)
+    assert torch.equal(some.of_y, whole.of_y[rows])
+    expected = (x - y[whole.of_x]).square().sum(-1).mean() + (y[rows] - x[whole.of_y[rows]]).square().sum(-1).mean()
+    torch.testing.assert_close(chamfer_distance(x, y, some), expected)
+
+
 def test_distance_is_symmetric_and_zero_only_for_the_same_cloud(clouds):
     x, y = clouds
     torch.testing.assert_close(chamfer_distance(x, y, match(x, y)), chamfer_distance(y, x, match(y, x)))

@@ -1,11 +1,14 @@
 """Eq. 7: only G moves, and it finds what it should; the baseline by skinning is exact where nothing moves."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from workbench.geometry.mesh import vertex_normals
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
+from workbench.points.clothed_points import clothed
 from workbench.points.scan_fitting import FittedOutfit, ScanFitConfig, features_of, fit_scan, lbs_of_scan
 from workbench.points.scans import ScanFrame
 from workbench.points.uv_position_map import atlas_of, posed_bodies, posed_queries
@@ -29,13 +32,15 @@ def skin_of(body, bodies):
 
 
 def test_a_cloud_of_the_model_s_own_is_found_again(body, small_model, trained_like, tmp_path):
-    """The scan is what the model makes of another G: the loss falls to a fraction; networks do not move."""
+    """The scan is what the model makes of a G between two outfits: the loss falls to a fraction; networks stay."""
     model, bodies = trained_like(small_model), frame_of(body)
     with torch.no_grad():
         model.geometry.stored.mul_(300)  # outfits that differ
         atlas = atlas_of(body, 48)
         posed = posed_queries(atlas.queries, bodies)
-        cloud = model(atlas_of(body, 32).map_of(bodies.neutral), torch.tensor([1]), posed)
+        between = model.geometry.smooth(0.8 * model.geometry.tensors[:1] - 0.6 * model.geometry.tensors[1:2])
+        pose = model.encoder(atlas_of(body, 32).map_of(bodies.neutral))
+        cloud = clothed(posed, model.decode(atlas.queries.u, pose, between))
     scan = ScanFrame(cloud.points[0], cloud.normals[0])
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     fitted, _ = fit_scan(model, body, scan, bodies, CONFIG, betas=body.mean_shape(), name="own")
@@ -53,6 +58,24 @@ def test_a_cloud_of_the_model_s_own_is_found_again(body, small_model, trained_li
         model.decoder.to_normal.bias += 1
     with pytest.raises(ValueError, match="was fitted with other networks"):
         features_of(model, read)
+
+
+def test_it_begins_at_the_outfit_that_is_nearest(body, small_model, trained_like):
+    """The scan is an outfit that the model knows: no step is needed to be there."""
+    model, bodies = trained_like(small_model), frame_of(body)
+    with torch.no_grad():
+        model.geometry.stored.mul_(300)
+        atlas = atlas_of(body, 48)
+        posed = posed_queries(atlas.queries, bodies)
+        cloud = model(atlas_of(body, 32).map_of(bodies.neutral), torch.tensor([1]), posed)
+    scan = ScanFrame(cloud.points[0], cloud.normals[0])
+    still = replace(
+        CONFIG,
+        weights=replace(CONFIG.weights, geometry=0.0),
+        fit=replace(CONFIG.fit, steps=1, learning_rate=1e-12, last_rate=1e-12),
+    )
+    fitted, _ = fit_scan(model, body, scan, bodies, still, betas=body.mean_shape())
+    torch.testing.assert_close(fitted.G, model.geometry.tensors[1:2].detach(), atol=1e-9, rtol=1e-6)
 
 
 def test_a_scan_that_is_elsewhere_is_refused(body, small_model):

@@ -42,16 +42,28 @@ class Matches:
     """Nearest neighbours both ways between clouds x and y."""
 
     of_x: Int[Tensor, "M"]  # argmin_j |x_i - y_j|
-    of_y: Int[Tensor, "N"]  # argmin_i |x_i - y_j|
+    of_y: Int[Tensor, "K"]  # argmin_i |x_i - y_j| of the rows j that were asked for
+    rows: Int[Tensor, "K"] | None = None  # of y; all when absent
 
 
-def match(x: Float[Tensor, "M 3"], y: Float[Tensor, "N 3"], *, nearest_in_y: NearestPoint | None = None) -> Matches:
-    """Nearest neighbours both ways; `nearest_in_y` is the search in y where it is asked more than once."""
+def match(
+    x: Float[Tensor, "M 3"],
+    y: Float[Tensor, "N 3"],
+    *,
+    nearest_in_y: NearestPoint | None = None,
+    rows: Int[Tensor, "K"] | None = None,
+) -> Matches:
+    """Nearest neighbours both ways: of every x in all of y, and of `rows` of y (all by default) in x.
+
+    `nearest_in_y` is the search in y where it is asked more than once.
+    """
+    asked = y if rows is None else y[rows]
     if x.device.type != "cpu" and nearest_in_y is None:
-        return Matches(nearest_by_all_distances(x, y), nearest_by_all_distances(y, x))
-    x_points, y_points = x.detach().cpu().numpy(), y.detach().cpu().numpy()
-    in_y = NearestPoint(y_points) if nearest_in_y is None else nearest_in_y
-    return Matches(torch.from_numpy(in_y(x_points)), torch.from_numpy(NearestPoint(x_points)(y_points)))
+        return Matches(nearest_by_all_distances(x, y), nearest_by_all_distances(asked, x), rows)
+    x_points = x.detach().cpu().numpy()
+    in_y = NearestPoint(y.detach().cpu().numpy()) if nearest_in_y is None else nearest_in_y
+    of_y = NearestPoint(x_points)(asked.detach().cpu().numpy())
+    return Matches(torch.from_numpy(in_y(x_points)), torch.from_numpy(of_y), rows)
 
 
 @torch.no_grad()
@@ -65,7 +77,8 @@ def nearest_by_all_distances(points: Float[Tensor, "M 3"], cloud: Float[Tensor, 
 def chamfer_distance(x: Float[Tensor, "M 3"], y: Float[Tensor, "N 3"], matches: Matches) -> Float[Tensor, ""]:
     """Mean squared distance to the nearest point, both ways, in m^2 (paper 2, Eq. 4 as written)."""
     to_y = (x - y[matches.of_x]).square().sum(-1).mean()
-    to_x = (y - x[matches.of_y]).square().sum(-1).mean()
+    asked = y if matches.rows is None else y[matches.rows]
+    to_x = (asked - x[matches.of_y]).square().sum(-1).mean()
     return to_y + to_x
 
 

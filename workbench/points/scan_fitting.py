@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from workbench.body.model import Body
-from workbench.geometry.chamfer import match
+from workbench.geometry.chamfer import NearestPoint, match
 from workbench.geometry.closest_point import ClosestPoint
 from workbench.learning.fit import FitConfig, FitResult, fit
 from workbench.npz import read_npz
@@ -29,7 +29,7 @@ from workbench.points.losses import (
     normal_loss,
 )
 from workbench.points.scans import ScanFrame
-from workbench.points.training import Precision, autocast, thin
+from workbench.points.training import Precision, autocast
 from workbench.points.uv_position_map import (
     QUERY_SIZE,
     PosedBodies,
@@ -48,7 +48,7 @@ class ScanFitConfig:
     """How one scan is fitted."""
 
     fit: FitConfig = FitConfig(
-        steps=200, learning_rate=4e-3, last_rate=2e-4, warmup=5, clip_norm=1e9, checkpoint_every=10**9
+        steps=500, learning_rate=1.2e-2, last_rate=2e-4, warmup=5, clip_norm=1e9, checkpoint_every=10**9
     )  # ours: facts.md 2 has 401 steps of 5e-4; larger and falling rates reach the same loss sooner
     weights: LossWeights = LOOSE
     queries: int = 6000  # pixels a step
@@ -110,7 +110,7 @@ def fit_scan(
     name: str = "scan",
     watch: Callable[[int, float], None] | None = None,
 ) -> tuple[FittedOutfit, FitResult]:
-    """argmin_G L_total(Y)      (Eq. 7), from the mean of the trained G.
+    """argmin_G L_total(Y)      (Eq. 7), from the mean of the trained G or that of an outfit, whichever is nearest.
 
     scan, bodies, betas: one frame in the pelvis frame; the model is in evaluation mode and is not changed.
     Raises ValueError where the body does not lie in the scan.
@@ -122,30 +122,43 @@ def fit_scan(
     try:
         with torch.no_grad(), autocast(config.precision, image.device):
             pose = model.encoder(image).float()
-        G = model.geometry.mean()[None].clone().requires_grad_()
+        in_scan = NearestPoint(scan.points.numpy())
 
-        def terms_at(asked: SurfaceQueries, seen: ScanFrame) -> LossTerms:
+        def terms_at(
+            G: Float[Tensor, "1 c H W"], asked: SurfaceQueries, rows: Int[Tensor, " K"] | None = None
+        ) -> LossTerms:
             posed = posed_queries(asked, bodies)
             with autocast(config.precision, image.device):
                 canonical = model.decode(asked.u, pose, model.geometry.smooth(G))
             cloud = clothed(posed, canonical)
             x, n_x = cloud.points[0], cloud.normals[0]
-            matches = match(x, seen.points)
+            matches = match(x, scan.points, nearest_in_y=in_scan, rows=rows)
             return LossTerms(
-                distance=distance_loss(x, seen.points, matches),
-                normal=normal_loss(n_x, seen.normals, matches),
+                distance=distance_loss(x, scan.points, matches),
+                normal=normal_loss(n_x, scan.normals, matches),
                 displacement=displacement_loss(cloud.displacement),
                 geometry=geometry_loss(G),
             )
 
-        def loss_of(step: int, generator: torch.Generator) -> Tensor:
+        def drawn(generator: torch.Generator) -> tuple[SurfaceQueries, Int[Tensor, " K"]]:
             asked = places.subset(torch.randperm(len(places), generator=generator)[: config.queries])
-            return terms_at(asked, thin(scan, config.scan_points, generator)).total(config.weights)
+            return asked, torch.randperm(len(scan.points), generator=generator)[: config.scan_points]
 
+        def loss_of(step: int, generator: torch.Generator) -> Tensor:
+            return terms_at(G, *drawn(generator)).total(config.weights)
+
+        @torch.no_grad()
+        def nearest_start() -> Float[Tensor, "1 c H W"]:
+            starts = torch.cat([model.geometry.mean()[None], model.geometry.tensors.detach()])
+            same = drawn(torch.Generator().manual_seed(config.seed))
+            losses = [terms_at(start[None], *same).total(config.weights).item() for start in starts]
+            return starts[losses.index(min(losses))][None].clone()
+
+        @torch.no_grad()
         def whole_loss() -> float:
-            with torch.no_grad():
-                return terms_at(places, scan).total(config.weights).item()
+            return terms_at(G, places).total(config.weights).item()
 
+        G = nearest_start().requires_grad_()
         before = whole_loss()
         generator = torch.Generator().manual_seed(config.seed)
         result = fit([G], loss_of, config.fit, generator=generator, label=f"fit {name}", watch=watch)
