@@ -54,7 +54,7 @@ ABLATIONS = {
 
 @dataclass(frozen=True)
 class ModelsConfig:
-    """Train what dresses a garment from its shipped training set (half an hour on two cores; resumable)."""
+    """Train what dresses a garment from its shipped training set (an hour on two cores; resumable)."""
 
     garment: str = "tshirt"
     out: Path = Path("workbench/assets/models")
