@@ -42,12 +42,12 @@ class Trained:
 def after_equal_time(scans: Sequence[ScanSequence], body: Body, seconds: float, seed: int) -> tuple[Trained, Trained]:
     """(the published sizes and settings, ours) after as many steps as fit into `seconds`, one at least."""
     frames = sum(len(scan) for scan in scans)
-    published = replace(papers_training(frames), calibration=CALIBRATION)
-    ours = replace(PointTrainingConfig(), calibration=CALIBRATION)
-    return tuple(
-        trained_for(seconds, scans, body, sizes, replace(config, seed=seed))
-        for sizes, config in ((PointModelConfig(), published), (TWO_CORES, ours))
-    )  # pyright: ignore[reportReturnType]  two of them
+    published = replace(papers_training(frames), calibration=CALIBRATION, seed=seed)
+    ours = replace(PointTrainingConfig(), calibration=CALIBRATION, seed=seed)
+    return (
+        trained_for(seconds, scans, body, PointModelConfig(), published),
+        trained_for(seconds, scans, body, TWO_CORES, ours),
+    )
 
 
 def trained_for(
