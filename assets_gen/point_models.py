@@ -40,7 +40,7 @@ class PointModelsConfig:
     # Where training keeps its state.
     work: Path = Path("out/points")
     pop: TrainPointsConfig = TrainPointsConfig()
-    # As many steps as take each outfit about as long as POP takes an outfit: 290 and 310 CPU-s.
+    # As many steps as take each outfit about as long as POP takes an outfit: 280 and 310 CPU-s.
     patches: TrainPointsConfig = TrainPointsConfig(
         method="patches", outfits="tshirt,dress", training=PointTrainingConfig(fit=replace(STEPS, steps=2500))
     )
