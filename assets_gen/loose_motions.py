@@ -2,9 +2,9 @@
 
 A choreography shares a bend among the joints of the spine, lets the clavicle follow the arm and keeps feet planted.
 People, and the skeletons that motion capture is put on, share otherwise: here every joint that moves a garment wanders
-by itself about what the motion asks of it, and in half of the motions one joint has the bend of the whole spine, as on
-skeletons that have no other.  Loosened motions of the families hardly bend a hip by 110 degrees, and those that do push
-the thigh into the belly; lifted ones do little else, and are for clearing.
+by itself about what the motion asks of it; in half of the motions the joints of the spine wander as one, and the lowest
+has the bend of all, as on skeletons that have no other.  Loosened motions of the families hardly bend a hip by 110
+degrees, and those that do push the thigh into the belly; lifted ones do little else, and are for clearing.
 """
 
 from dataclasses import replace
@@ -35,25 +35,29 @@ RATE = 0.6  # Hz: the fastest a joint wanders
 
 
 def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
-    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS; then, or not, the spine's bend
-    gathered in its lowest joint.
+    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS; in half of all the spine
+    wanders as one, and its bend is gathered in its lowest joint.
 
     Feet slide and may sink: for networks that see theta alone.
     """
     frames, angles = joint_frames(motion.skeleton), joint_angles(motion)
     times = np.arange(len(motion)) / motion.fps
     rotations = motion.rotations.clone()
+    gather = rng.random() < 0.5
+    of_spine = np.stack([wander(rng, times, -a, a, RATE) for a in AMPLITUDES[SPINE[0]]], axis=-1)
     for joint, usual in angles.items():
         amplitudes = AMPLITUDES.get(joint.removeprefix("Left").removeprefix("Right"))
         if amplitudes is None:
             continue
         added = np.stack([wander(rng, times, -a, a, RATE) for a in amplitudes], axis=-1)
+        if gather and joint in SPINE:
+            added = of_spine
         limit = limit_of(joint)
         allowed = torch.tensor([limit.flexion, limit.abduction, limit.twist], dtype=torch.float64)
         meant = torch.clamp(usual + torch.from_numpy(added), allowed[:, 0], allowed[:, 1])
         rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
     loose = replace(motion, rotations=rotations, name=f"{motion.name}_loose")
-    return gathered(loose) if rng.random() < 0.5 else loose
+    return gathered(loose) if gather else loose
 
 
 def lifted(motion: Motion, rng: np.random.Generator) -> Motion:

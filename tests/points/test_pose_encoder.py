@@ -27,6 +27,19 @@ def test_a_map_that_cannot_be_halved_is_refused():
         PoseEncoder(PoseEncoderConfig(depth=0), generator=torch.Generator())
 
 
+def test_a_map_with_too_few_channels_is_refused_and_further_ones_are_not_read():
+    generator = torch.Generator().manual_seed(0)
+    of_pose, of_both = (
+        PoseEncoder(PoseEncoderConfig(depth=3, width=4, features=4, channels=channels), generator=generator).eval()
+        for channels in (3, 6)
+    )
+    image = torch.randn(1, 6, 16, 16, generator=generator)
+    torch.testing.assert_close(of_pose(image), of_pose(image[:, :3]))
+    assert (of_both(image) - of_both(image.clone().index_fill_(1, torch.tensor([4]), 0.0))).abs().max() > 1e-3
+    with pytest.raises(ValueError, match="maps of 6 channels, got 3"):
+        of_both(image[:, :3])
+
+
 def test_one_seed_one_network():
     config = PoseEncoderConfig(depth=3, width=4)
     one, two = (PoseEncoder(config, generator=torch.Generator().manual_seed(4)) for _ in range(2))

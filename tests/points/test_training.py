@@ -10,6 +10,7 @@ from workbench.learning.fit import FitConfig
 from workbench.points.clothed_points import PointModel
 from workbench.points.scans import ScanFrame, ScanSequence
 from workbench.points.training import (
+    Jitter,
     PointTrainingConfig,
     ScanSet,
     looked_at,
@@ -123,19 +124,26 @@ def test_the_end_of_a_run_looks_at_more():
     assert looked_at(10**6, papers_training(100)).queries == papers_training(100).queries
 
 
-def test_only_the_encoder_sees_the_turns(scans):
-    """What the encoder is shown is the body turned so; scan, points and frames T are those of the true pose."""
-    none = torch.eye(3).expand(2, len(scans.body.parents), 3, 3)
-    vectors = torch.zeros(2, len(scans.body.parents), 3)
+def test_only_the_encoder_sees_jitter(scans):
+    """What the encoder is shown is the body turned and built so; scan, points and frames T are those of the truth."""
+    joints, shapes = len(scans.body.parents), scans.body.shape_count
+    vectors, betas = torch.zeros(2, joints, 3), torch.zeros(2, shapes)
     vectors[:, scans.body.skeleton.index("LeftArm")] = 0.3
-    plain, same, turned = (
-        scans.batch([0, 4]),
-        scans.batch([0, 4], none),
-        scans.batch([0, 4], axis_angle_to_matrix(vectors)),
+    heavier = betas.index_fill(1, torch.tensor([1]), 1.0)
+    plain, same, turned, built = (
+        scans.batch([0, 4], jitter)
+        for jitter in (
+            None,
+            Jitter(axis_angle_to_matrix(torch.zeros(2, joints, 3)), betas),
+            Jitter(axis_angle_to_matrix(vectors), betas),
+            Jitter(axis_angle_to_matrix(torch.zeros(2, joints, 3)), heavier),
+        )
     )
     torch.testing.assert_close(same.position_map, plain.position_map, atol=1e-6, rtol=0)
-    assert (turned.position_map - plain.position_map).norm(dim=1).max() > 0.02  # metres
-    for batch in (same, turned):
+    for batch, pose, build in ((turned, True, False), (built, False, True)):
+        moved = (batch.position_map - plain.position_map).unflatten(1, (2, 3)).norm(dim=2).amax((0, 2, 3))
+        assert (moved > 0.02).tolist() == [pose, build]  # metres, and 4 mm of build
+    for batch in (same, turned, built):
         assert torch.equal(batch.bodies.vertices, plain.bodies.vertices)
         assert torch.equal(batch.bodies.transforms, plain.bodies.transforms)
         assert torch.equal(batch.scans[1].points, plain.scans[1].points)

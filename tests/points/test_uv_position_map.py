@@ -15,6 +15,7 @@ from workbench.points.uv_position_map import (
     Atlas,
     atlas_fingerprint,
     atlas_of,
+    builds,
     heading,
     pelvis_frame,
     posed_bodies,
@@ -123,13 +124,20 @@ def test_where_the_body_stands_and_looks_changes_nothing(body):
     torch.testing.assert_close(frame.to_world(two.vertices), world, atol=1e-5, rtol=0)
 
 
-def test_the_encoder_never_sees_the_shape(body):
-    rotations = poses(body, 1)
-    one = posed_bodies(body, rotations, torch.zeros(1, body.shape_count))
-    two = posed_bodies(body, rotations, torch.ones(1, body.shape_count))
-    torch.testing.assert_close(one.neutral, two.neutral)
-    torch.testing.assert_close(one.neutral, one.vertices, atol=1e-6, rtol=0)
-    assert (two.vertices - one.vertices).abs().max() > 0.01
+def test_what_is_seen_tells_pose_and_build_apart(body):
+    """The neutral body knows no shape; the build knows no pose, and adds up to the own body at rest."""
+    rotations, mean = poses(body, 2), body.mean_shape()
+    betas = torch.linspace(-1, 1, body.shape_count)
+    plain, own = posed_bodies(body, rotations, mean), posed_bodies(body, rotations, betas)
+    torch.testing.assert_close(plain.neutral, own.neutral)
+    torch.testing.assert_close(plain.neutral, plain.vertices, atol=1e-6, rtol=0)
+    assert (own.vertices - plain.vertices).abs().max() > 0.01
+    assert not plain.build.any()
+    torch.testing.assert_close(own.build[0], own.build[1])
+    rest = posed_bodies(body, body.rest_rotations()[None], betas)
+    torch.testing.assert_close(rest.neutral + rest.build, rest.vertices, atol=1e-6, rtol=0)
+    torch.testing.assert_close(builds(body, mean + 2 * (betas - mean)), 2 * own.build[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(own.seen[..., :3], own.neutral)
 
 
 @settings(max_examples=25, deadline=None)

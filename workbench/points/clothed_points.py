@@ -77,13 +77,13 @@ class PointModel(nn.Module):
         return self.geometry.tensors
 
     def forward(
-        self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
+        self, position_map: Float[Tensor, "B i H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
     ) -> ClothedPoints:
         """The clothes of each frame's outfit at the queries."""
         return self.dress(position_map, self.geometry(outfit), posed)
 
     def dress(
-        self, position_map: Float[Tensor, "B 3 H W"], geometry: Float[Tensor, "B d h w"], posed: PosedQueries
+        self, position_map: Float[Tensor, "B i H W"], geometry: Float[Tensor, "B d h w"], posed: PosedQueries
     ) -> ClothedPoints:
         """The same with smoothed geometry features that are given (of a scan that was fitted, Eq. 7)."""
         pose = self.encoder(position_map)

@@ -64,7 +64,7 @@ class Dresser:
     @torch.no_grad()
     def __call__(self, bodies: PosedBodies) -> ClothedPoints:
         """Clothes on bodies in the pelvis frame, frame by frame."""
-        image = self._atlas.map_of(bodies.neutral)
+        image = self._atlas.map_of(bodies.seen)
         with autocast(self.precision, image.device):
             pose = self.model.encoder(image).float()
         frames = [self._decode(P[None]) for P in pose]

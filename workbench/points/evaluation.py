@@ -95,7 +95,7 @@ def errors_on(scans: ScanSet, dress: Callable[[Batch], ClothedPoints]) -> list[C
 def dress_every_pixel(
     model: PointModel,
     geometry: Float[Tensor, "1 d h w"],
-    image: Float[Tensor, "1 3 H W"],
+    image: Float[Tensor, "1 i H W"],
     queries: SurfaceQueries,
     bodies: PosedBodies,
     query_size: int,
@@ -129,7 +129,7 @@ def forward_times(
     model.eval()
     with torch.no_grad():
         geometry = model.geometry(torch.tensor([0]))
-    image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
+    image = atlas_of(body, model.config.input_size).map_of(bodies.seen)
     queries = atlas_of(body, query_size).queries
     dresser = Dresser(model, geometry, body, query_size=query_size)
     plain = dress_every_pixel(model, geometry, image, queries, bodies, query_size)

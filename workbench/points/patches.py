@@ -56,7 +56,7 @@ class PatchModel(nn.Module):
         return next(self.parameters()).new_zeros(1, 1, 1, 1)
 
     def forward(
-        self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
+        self, position_map: Float[Tensor, "B i H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
     ) -> ClothedPoints:
         """Patches at the pixels that `posed` holds; points patch by patch.
 

@@ -1,4 +1,4 @@
-"""Sec. 3.2: what the pose does to clothes, for every point of the body.  I (B,3,H,W) -> P (B,64,H,W).
+"""Sec. 3.2: what the pose does to clothes, for every point of the body.  I (B,3 or 6,H,W) -> P (B,64,H,W).
 
 One UNet whose depth is a number: each level halves the map by a 4x4 convolution of stride 2, and the way up doubles it,
 by transposed convolutions below and by bilinear reading and 3x3 convolutions in the last three levels (transposed ones
@@ -24,17 +24,19 @@ class PoseEncoderConfig:
     width: int = 32  # channels of the first level
     features: int = 64  # channels of P; section 3.2
     reach: float = 1.0  # metres that become 1 at the input; ours
+    # 3: the neutral body alone, as published.  6: also the build of who wears the clothes (`PosedBodies.seen`)
+    channels: int = 3
 
 
 class PoseEncoder(nn.Module):
-    """A position map of the neutral body (metres) -> pose features, pixel for pixel."""
+    """A position map (`PosedBodies.seen`, of which it reads the first channels) -> pose features, pixel for pixel."""
 
     def __init__(self, config: PoseEncoderConfig = PoseEncoderConfig(), *, generator: torch.Generator):
         super().__init__()
         if config.depth < 1:
             raise ValueError(f"the pose encoder needs at least one level, got depth={config.depth}")
         self.config = config
-        down = [3, *[config.width * min(2**level, WIDEST) for level in range(config.depth)]]
+        down = [config.channels, *[config.width * min(2**level, WIDEST) for level in range(config.depth)]]
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
         for level in range(config.depth):
             # neither the first nor the last level is normalised: at the bottom a map may be a single number
@@ -48,15 +50,22 @@ class PoseEncoder(nn.Module):
         _initialise(self, generator)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  with bfloat16, 222 ms a step against 400 (facts.md 2)
 
-    def forward(self, position_map: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B c H W"]:
-        """Raises ValueError where the map cannot be halved `depth` times."""
+    def forward(self, position_map: Float[Tensor, "B i H W"]) -> Float[Tensor, "B c H W"]:
+        """Raises ValueError where the map cannot be halved `depth` times, or has too few channels."""
         height, width = position_map.shape[-2:]
         if height % 2**self.config.depth or width % 2**self.config.depth:
             raise ValueError(
                 f"a map of {height} x {width} pixels cannot be halved {self.config.depth} times; "
                 f"give sides that are multiples of {2**self.config.depth}, or lower the encoder's depth"
             )
-        x = (position_map / self.config.reach).contiguous(memory_format=torch.channels_last)
+        if position_map.shape[-3] < self.config.channels:
+            raise ValueError(
+                f"this pose encoder reads maps of {self.config.channels} channels, got {position_map.shape[-3]}; "
+                "give it `atlas.map_of(bodies.seen)`"
+            )
+        x = (position_map[..., : self.config.channels, :, :] / self.config.reach).contiguous(
+            memory_format=torch.channels_last
+        )
         levels = []
         for down in self.down:
             x = down(x)

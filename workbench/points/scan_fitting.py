@@ -5,7 +5,7 @@ The pose does not change during a fit, so P is computed once; only G moves, and 
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from workbench.points.losses import (
     normal_loss,
 )
 from workbench.points.scans import ScanFrame
-from workbench.points.training import Precision, autocast
+from workbench.points.training import Precision, autocast, quick_precision
 from workbench.points.uv_position_map import (
     QUERY_SIZE,
     PosedBodies,
@@ -48,12 +48,12 @@ class ScanFitConfig:
     """How one scan is fitted."""
 
     fit: FitConfig = FitConfig(
-        steps=500, learning_rate=1.2e-2, last_rate=2e-4, warmup=5, clip_norm=1e9, checkpoint_every=10**9
+        steps=1000, learning_rate=1.2e-2, last_rate=1e-3, warmup=5, clip_norm=1e9, checkpoint_every=10**9
     )  # ours: facts.md 2 has 401 steps of 5e-4; larger and falling rates reach the same loss sooner
     weights: LossWeights = LOOSE
     queries: int = 6000  # pixels a step
     scan_points: int = 12000  # of the scan a step
-    precision: Precision = "float32"
+    precision: Precision = field(default_factory=quick_precision)  # of the decoder, while G moves
     query_size: int = QUERY_SIZE
     seed: int = 0
 
@@ -117,18 +117,21 @@ def fit_scan(
     """
     require_aligned(scan, bodies)
     places = atlas_of(body, config.query_size).queries
-    image = atlas_of(body, model.config.input_size).map_of(bodies.neutral)
+    image = atlas_of(body, model.config.input_size).map_of(bodies.seen)
     model.eval().requires_grad_(False)
     try:
-        with torch.no_grad(), autocast(config.precision, image.device):
-            pose = model.encoder(image).float()
+        with torch.no_grad():
+            pose = model.encoder(image)
         in_scan = NearestPoint(scan.points.numpy())
 
         def terms_at(
-            G: Float[Tensor, "1 c H W"], asked: SurfaceQueries, rows: Int[Tensor, " K"] | None = None
+            G: Float[Tensor, "1 c H W"],
+            asked: SurfaceQueries,
+            rows: Int[Tensor, " K"] | None = None,
+            precision: Precision = "float32",
         ) -> LossTerms:
             posed = posed_queries(asked, bodies)
-            with autocast(config.precision, image.device):
+            with autocast(precision, image.device):
                 canonical = model.decode(asked.u, pose, model.geometry.smooth(G))
             cloud = clothed(posed, canonical)
             x, n_x = cloud.points[0], cloud.normals[0]
@@ -145,7 +148,7 @@ def fit_scan(
             return asked, torch.randperm(len(scan.points), generator=generator)[: config.scan_points]
 
         def loss_of(step: int, generator: torch.Generator) -> Tensor:
-            return terms_at(G, *drawn(generator)).total(config.weights)
+            return terms_at(G, *drawn(generator), config.precision).total(config.weights)
 
         @torch.no_grad()
         def nearest_start() -> Float[Tensor, "1 c H W"]:

@@ -40,6 +40,7 @@ from workbench.points.uv_position_map import (
     PosedQueries,
     SurfaceQueries,
     atlas_of,
+    builds,
     neutral_bodies,
     posed_bodies,
     posed_queries,
@@ -53,7 +54,7 @@ class ClothesModel(Protocol):
     """What can be trained on scans: POP, and the patches it is compared with."""
 
     def __call__(
-        self, position_map: Float[Tensor, "B 3 H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
+        self, position_map: Float[Tensor, "B i H W"], outfit: Int[Tensor, " B"], posed: PosedQueries
     ) -> ClothedPoints: ...
 
     def parameters(self) -> Iterator[nn.Parameter]: ...
@@ -89,6 +90,7 @@ class PointTrainingConfig:
     # normals of 0.411 instead of 0.424, Chamfer 3.20 for 3.16, point to plane 1.33 for 1.09, and on the training's own
     # frames at Chamfer 1.85 for 1.63: less is learned by heart, and a longer training is to use that (not compared)
     pose_jitter: float = 0.05
+    shape_jitter: float = 0.3  # of each component of beta, in the build that the encoder sees; ours, not compared
     query_size: int = QUERY_SIZE
     calibration: int = 16  # batches over which the means and variances of BatchNorm are taken at the end
     seed: int = 0
@@ -108,6 +110,7 @@ def papers_training(frames: int) -> PointTrainingConfig:
         normals_from=250 / 401,
         precision="float32",
         pose_jitter=0.0,
+        shape_jitter=0.0,
     )
 
 
@@ -152,22 +155,32 @@ class ScanSet:
     def __len__(self) -> int:
         return len(self.places)
 
-    def batch(self, index: Sequence[int], turns: Float[Tensor, "B J 3 3"] | None = None) -> "Batch":
-        """Frames by their number in the set; the pose encoder sees the joints turned by `turns` as well."""
+    def batch(self, index: Sequence[int], jitter: "Jitter | None" = None) -> "Batch":
+        """Frames by their number in the set; the pose encoder sees other poses and builds as `jitter` says."""
         chosen = [self.places[i] for i in index]
         sequences = [self.scans[k] for k, _ in chosen]
         rotations = torch.stack([scan.rotations[t] for scan, (_, t) in zip(sequences, chosen, strict=True)])
         betas = torch.stack([scan.betas for scan in sequences])
         bodies = posed_bodies(self.body_there, rotations.to(self.device), betas.to(self.device))
-        neutral = bodies.neutral
-        if turns is not None:
-            neutral = neutral_bodies(self.body_there, (rotations @ turns).to(self.device))
+        seen = bodies
+        if jitter is not None:
+            turned, other = (rotations @ jitter.turns).to(self.device), (betas + jitter.betas).to(self.device)
+            there = self.body_there
+            seen = replace(bodies, neutral=neutral_bodies(there, turned), build=builds(there, other))
         return Batch(
             bodies=bodies,
-            position_map=self.atlas.map_of(neutral),
+            position_map=self.atlas.map_of(seen.seen),
             outfit=torch.tensor([self.outfits.index(scan.outfit) for scan in sequences], device=self.device),
             scans=[scan.frame(t) for scan, (_, t) in zip(sequences, chosen, strict=True)],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Jitter:
+    """What a batch's poses and shapes, as the encoder sees them, are off."""
+
+    turns: Float[Tensor, "B J 3 3"]
+    betas: Float[Tensor, "B K"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +188,7 @@ class Batch:
     """A few frames: what goes into a model and what should come out."""
 
     bodies: PosedBodies
-    position_map: Float[Tensor, "B 3 H W"]
+    position_map: Float[Tensor, "B i H W"]
     outfit: Int[Tensor, " B"]
     scans: list[ScanFrame]
 
@@ -286,11 +299,17 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16")
 
 
+def quick_precision() -> Precision:
+    """bfloat16 where the processor computes in it; elsewhere it is emulated, and float32 is quicker."""
+    known = getattr(torch.cpu, "_is_avx512_bf16_supported", None)  # torch has no public call that tells
+    return "bfloat16" if known is not None and known() else "float32"
+
+
 def _drawn(
     scans: ScanSet, places: SurfaceQueries, config: PointTrainingConfig, generator: torch.Generator
 ) -> tuple[Batch, PosedQueries]:
     index = torch.randint(len(scans), (config.batch,), generator=generator).tolist()
-    batch = scans.batch(index, _turns(scans, config, generator))
+    batch = scans.batch(index, _jitter(scans, config, generator))
     asked = places
     if config.queries < len(places):
         index = torch.randperm(len(places), generator=generator)[: config.queries]
@@ -299,12 +318,13 @@ def _drawn(
     return Batch(batch.bodies, batch.position_map, batch.outfit, thinned), posed_queries(asked, batch.bodies)
 
 
-def _turns(scans: ScanSet, config: PointTrainingConfig, generator: torch.Generator) -> Float[Tensor, "B J 3 3"] | None:
-    if not config.pose_jitter:
+def _jitter(scans: ScanSet, config: PointTrainingConfig, generator: torch.Generator) -> Jitter | None:
+    if not (config.pose_jitter or config.shape_jitter):
         return None
     vectors = config.pose_jitter * torch.randn(config.batch, len(scans.body.parents), 3, generator=generator)
     vectors[:, 0] = 0.0
-    return axis_angle_to_matrix(vectors)
+    betas = config.shape_jitter * torch.randn(config.batch, scans.body.shape_count, generator=generator)
+    return Jitter(axis_angle_to_matrix(vectors), betas)
 
 
 def thin(scan: ScanFrame, count: int, generator: torch.Generator) -> ScanFrame:

@@ -31,13 +31,14 @@ log = logging.getLogger(__name__)
 
 # Ours: half the paper's widths, so that a training fits two cores
 TWO_CORES = PointModelConfig(
-    encoder=PoseEncoderConfig(depth=6, width=16, features=32),
+    encoder=PoseEncoderConfig(depth=6, width=16, features=32, channels=6),
     geometry=GeometryFeaturesConfig(size=64, features=32),
     decoder=ShapeDecoderConfig(width=128, features=64),
     input_size=64,
 )
 TWO_CORES_PATCHES = PatchModelConfig(
-    encoder=PoseEncoderConfig(depth=5, width=16, features=32), decoder=ShapeDecoderConfig(width=128, features=34)
+    encoder=PoseEncoderConfig(depth=5, width=16, features=32, channels=6),
+    decoder=ShapeDecoderConfig(width=128, features=34),
 )
 Method = Literal["pop", "patches"]
 

@@ -20,6 +20,7 @@ from workbench.geometry.sampling import sample_surface
 from workbench.geometry.uv_raster import pixel_centres, rasterise
 
 INPUT_SIZE, QUERY_SIZE = 128, 256  # pixels of I and of the queries; facts.md 2
+BUILD_GAIN = 5.0  # of what sets a body apart from the mean shape, centimetres, beside positions, decimetres; ours
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,8 @@ def scattered_queries(body: Body, count: int, generator: np.random.Generator) ->
 class PosedBodies:
     """B bodies in the pelvis frame: what a point model knows of its frames."""
 
-    neutral: Float[Tensor, "B V 3"]  # of the mean shape: what the pose encoder sees
+    neutral: Float[Tensor, "B V 3"]  # of the mean shape
+    build: Float[Tensor, "B V 3"]  # at rest: the subject's own shape less the mean shape, pelvis on pelvis
     vertices: Float[Tensor, "B V 3"]  # of the subject's own shape
     transforms: Float[Tensor, "B V 3 3"]  # the blended rotation that skinning applies at each vertex
 
@@ -126,7 +128,12 @@ class PosedBodies:
     def at(self, index: int | slice | Tensor) -> "PosedBodies":
         """Some of the frames."""
         index = slice(index, index + 1) if isinstance(index, int) else index
-        return PosedBodies(self.neutral[index], self.vertices[index], self.transforms[index])
+        return PosedBodies(self.neutral[index], self.build[index], self.vertices[index], self.transforms[index])
+
+    @property
+    def seen(self) -> Float[Tensor, "B V 6"]:
+        """What a pose encoder may see: the neutral body, and the build.  The published one sees the first three."""
+        return torch.cat([self.neutral, BUILD_GAIN * self.build], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +152,7 @@ def posed_bodies(body: Body, rotations: Float[Tensor, "B J 3 3"], betas: Float[T
     transforms, _ = blended_affine(body.weights, own.transforms)
     return PosedBodies(
         neutral=neutral_bodies(body, rotations),
+        build=builds(body, betas).expand(len(rotations), -1, -1),
         vertices=body.vertices(local, betas) - own.joints[..., :1, :],
         transforms=transforms,
     )
@@ -154,6 +162,13 @@ def neutral_bodies(body: Body, rotations: Float[Tensor, "B J 3 3"]) -> Float[Ten
     """The mean shape in these poses, in the pelvis frame: what a pose encoder sees."""
     local, mean = _tilted(rotations), body.mean_shape()
     return body.vertices(local, mean) - body.pose(local, mean).joints[..., :1, :]
+
+
+def builds(body: Body, betas: Float[Tensor, "*B K"]) -> Float[Tensor, "*B V 3"]:
+    """What sets bodies apart from the mean shape at rest, pelvis on pelvis."""
+    mean = body.mean_shape()
+    pelvis = (body.joints(betas) - body.joints(mean))[..., :1, :]
+    return body.shape_offsets(betas) - body.shape_offsets(mean) - pelvis
 
 
 def _tilted(rotations: Float[Tensor, "B J 3 3"]) -> Float[Tensor, "B J 3 3"]:
