@@ -40,9 +40,9 @@ class PointModelsConfig:
     # Where training keeps its state.
     work: Path = Path("out/points")
     pop: TrainPointsConfig = TrainPointsConfig()
-    # As many steps as take each outfit about as long as POP takes an outfit: 280 and 310 CPU-s.
+    # As many steps as take each outfit about as long as POP takes an outfit: about 260 CPU-s.
     patches: TrainPointsConfig = TrainPointsConfig(
-        method="patches", outfits="tshirt,dress", training=PointTrainingConfig(fit=replace(STEPS, steps=2500))
+        method="patches", outfits="tshirt,dress", training=PointTrainingConfig(fit=replace(STEPS, steps=2300))
     )
     # Also train what Tab. 2 compares and does not ship: POP on a half, a quarter and an eighth of the scans, and POP
     # of each of the outfits that have patches.
