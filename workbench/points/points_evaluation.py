@@ -7,7 +7,7 @@ fitted (Eq. 7) from one scan and animated on the rest.
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,15 @@ from workbench.points.meshing import poisson_mesh
 from workbench.points.scan_fitting import ScanFitConfig, features_of, fit_scan, lbs_of_scan
 from workbench.points.scans import ScanSequence, load_scans
 from workbench.points.trained_points import TrainedPatches, TrainedPoints
-from workbench.points.training import Batch, PointTrainingConfig, ScanSet, papers_training, step_loss
+from workbench.points.training import (
+    Batch,
+    PointTrainingConfig,
+    Precision,
+    ScanSet,
+    papers_training,
+    quick_precision,
+    step_loss,
+)
 from workbench.points.training_run import shipped_scans, training_folder
 from workbench.points.uv_position_map import atlas_of, posed_queries
 
@@ -62,6 +70,8 @@ class PointsEvaluation:
     repeats: int = 3
     # Steps of a fit (Eq. 7); the default is that of `workbench fit`.
     fit_steps: int = ScanFitConfig().fit.steps
+    # In which its decoder is computed; the default is that of `workbench fit`, whatever is quicker here.
+    fit_precision: Precision = field(default_factory=quick_precision)
     seed: int = 0
 
 
@@ -241,7 +251,7 @@ def unseen_rows(
     fitted_errors: list[CloudError] = []
     skinned_errors: list[CloudError] = []
     made: list[Row] = []
-    fitting = fit_config(config.fit_steps)
+    fitting = fit_config(config)
     for outfit in sorted({scan.outfit for scan in scans}):
         first, *others = [scan for scan in scans if scan.outfit == outfit]
         worn = ScanSet.of(body, [first]).batch([0])
@@ -252,7 +262,7 @@ def unseen_rows(
         made.append(told(f"fit of {outfit}: loss before", fitted.loss_before, ""))
         made.append(told(f"fit of {outfit}: loss after", fitted.loss_after, ""))
         if config.long_fit:
-            longer = fit_config(10 * config.fit_steps)
+            longer = fit_config(config, times=10)
             best, _ = fit_scan(trained.model, body, worn.scans[0], worn.bodies, longer, betas=first.betas)
             ratio = 100 * (fitted.loss_after / best.loss_after - 1)
             made.append(at_most(f"fit of {outfit}: loss above a 10 times longer fit", ratio, "%", 5))
@@ -276,9 +286,10 @@ def unseen_rows(
     ]
 
 
-def fit_config(steps: int) -> ScanFitConfig:
-    """Of `workbench fit`, with another number of steps."""
-    return replace(ScanFitConfig(), fit=replace(ScanFitConfig().fit, steps=steps))
+def fit_config(config: PointsEvaluation, times: int = 1) -> ScanFitConfig:
+    """Of `workbench fit`, with the steps that are asked for, or so many times as many."""
+    usual = ScanFitConfig()
+    return replace(usual, fit=replace(usual.fit, steps=times * config.fit_steps), precision=config.fit_precision)
 
 
 # Times
