@@ -61,7 +61,7 @@ class PointsEvaluation:
     data: Path | None = None
     # Of each test sequence, evenly spread; 0 is all.
     frames: int = 4
-    # Also fit 10 times longer, and compare the loss (15 minutes more).
+    # Also fit 10 times longer, and compare the loss (half an hour more).
     long_fit: bool = False
     # A step of the paper's training takes a minute.
     paper_step: bool = True
