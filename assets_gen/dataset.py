@@ -29,7 +29,7 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.projection import Projector
 from workbench.collisions.sequences import SimulatedSequence
-from workbench.garments import Garment
+from workbench.garments import Garment, shipped_garments
 from workbench.geometry.strain import rest_triangles
 from workbench.store import Store, add_to_manifest, code_version, describe
 
@@ -54,6 +54,7 @@ class DatasetConfig:
     """Simulate and project the training and test sequences of a garment (hours; what is finished is kept)."""
 
     garment: str = "tshirt"
+    """the name of one that ships, or a file (OBJ, PLY, npz) of your own, fitted to the canonical body"""
     per_family: int = 12
     """training motions of each family"""
     test_motions: int = 11
@@ -133,7 +134,7 @@ def chosen(planned: list[PlannedSequence], only: Sequence[str]) -> list[PlannedS
 
 def simulated(config: DatasetConfig, body: Body) -> tuple[list[PlannedSequence], list[Path | None]]:
     """The files of the plan, made where they are missing (None where a simulation failed)."""
-    planned, garment = chosen(plan(config, body), config.only), Garment.load(config.garment)
+    planned, garment = chosen(plan(config, body), config.only), asked_garment(config, body)
     tasks = [_task(config, body, garment, one) for one in planned]
     request = SimulationsConfig(
         out=config.out, workers=config.workers, scheduler=config.scheduler, record=config.record
@@ -144,9 +145,21 @@ def simulated(config: DatasetConfig, body: Body) -> tuple[list[PlannedSequence],
     return planned, paths
 
 
+def asked_garment(config: DatasetConfig, body: Body) -> Garment:
+    """The garment of the config.  Raises ValueError for a file whose name would pass for a garment that ships."""
+    garment = Garment.load(config.garment, body)
+    if not garment.ships and garment.name in shipped_garments():
+        raise ValueError(f"{config.garment}: a garment {garment.name!r} ships; give your own another name")
+    if config.ship and not garment.ships:
+        raise ValueError(
+            f"{config.garment} is your own: --ship is for those of the package, what is made lies in --out"
+        )
+    return garment
+
+
 def _task(config: DatasetConfig, body: Body, garment: Garment, one: PlannedSequence) -> Task:
     return Task(
-        name=f"{config.garment}-{one.motion}",
+        name=f"{garment.name}-{one.motion}",
         motion=generate(one.motion, body.skeleton),
         betas=one.betas,
         garment=garment,
@@ -158,14 +171,15 @@ def _task(config: DatasetConfig, body: Body, garment: Garment, one: PlannedSeque
 def run(config: DatasetConfig) -> None:
     """Simulate and project what is missing, report every sequence, write the compact set (not of a chosen few)."""
     body = Body.default()
+    garment = asked_garment(config, body)
     planned, paths = simulated(config, body)
     made = [(one, path) for one, path in zip(planned, paths, strict=True) if path is not None]
     for _, path in made:
         print(report_line(path))
     if config.only:
         return
-    gathered = gather(config, body, [(one, path) for one, path in made if one.split != "test"])
-    target = config.out / f"{config.garment}.npz"
+    gathered = gather(config, body, garment, [(one, path) for one, path in made if one.split != "test"])
+    target = config.out / f"{garment.name}.npz"
     gathered.save(target)
     print(describe_set(gathered, target))
     if config.ship:
@@ -173,9 +187,11 @@ def run(config: DatasetConfig) -> None:
         _ship_tests(config, [(one, path) for one, path in made if one.split == "test"])
 
 
-def gather(config: DatasetConfig, body: Body, made: Sequence[tuple[PlannedSequence, Path]]) -> CanonicalSet:
+def gather(
+    config: DatasetConfig, body: Body, garment: Garment, made: Sequence[tuple[PlannedSequence, Path]]
+) -> CanonicalSet:
     """The compact set of simulated sequences: each projected (Eq. 9; kept once made), then all of them condensed."""
-    garment, store, code = Garment.load(config.garment), Store(config.out / "projected"), code_version(*PROJECTED_BY)
+    store, code = Store(config.out / "projected"), code_version(*PROJECTED_BY)
     projector = Projector(
         GarmentModel(body, GridFields.default()),
         GridSDF.default(),
@@ -217,7 +233,7 @@ def gather(config: DatasetConfig, body: Body, made: Sequence[tuple[PlannedSequen
     finally:
         torch.set_num_threads(threads)
     generator = torch.Generator().manual_seed(0)
-    return compact(done, config.garment, config.record.cloth.fps, rank=config.rank, generator=generator)
+    return compact(done, garment, config.record.cloth.fps, rank=config.rank, generator=generator)
 
 
 def describe_set(gathered: CanonicalSet, path: Path) -> str:

@@ -25,7 +25,6 @@ from workbench.collisions.regressor import TrainRegressorConfig
 from workbench.collisions.regressor import run as train_regressor
 from workbench.collisions.subspace import LossWeights, TrainSubspaceConfig
 from workbench.collisions.subspace import run as train_subspace
-from workbench.garments import Garment
 from workbench.motion import Motion
 from workbench.store import add_to_manifest, code_version
 
@@ -58,9 +57,12 @@ ABLATIONS = {
 
 @dataclass(frozen=True)
 class ModelsConfig:
-    """Train what dresses a garment from its shipped training set (an hour on two cores; resumable)."""
+    """Train what dresses a garment from its training set (an hour on two cores; resumable)."""
 
     garment: str = "tshirt"
+    data: Path | None = None
+    """the training set of your own garment (`python -m assets_gen dataset`), whose networks stay in `work`; when
+    absent, that of GARMENT which ships, whose networks are copied to `out`"""
     out: Path = Path("workbench/assets/models")
     work: Path = Path("out/models")  # where training keeps its state, and the ablations stay
     subspace: TrainSubspaceConfig = TrainSubspaceConfig()
@@ -82,11 +84,13 @@ class ModelsConfig:
 
 def run(config: ModelsConfig) -> None:
     """Write GARMENT-subspace, -regressor and -corrective.safetensors with their manifest entries, or ablations."""
+    if config.data is not None:
+        config = replace(config, garment=CanonicalSet.load(config.data).garment_name)
     if config.ablations:
         for suffix in config.ablations:
             ablation(config, suffix)
         return
-    here: dict[str, Any] = {"garment": config.garment, "out": config.work}
+    here: dict[str, Any] = {"garment": config.garment, "out": config.work, "data": config.data}
     stories: dict[str, Any] = {}
     _take_ready(config)
     if "subspace" in config.stages:
@@ -101,6 +105,8 @@ def run(config: ModelsConfig) -> None:
             weights = CORRECTIVE_WEIGHTS.get(config.garment, weights)
         learned = replace(config.corrective, motions=motions, uncleared=uncleared, weights=weights, **here)
         stories["corrective"] = train_corrective(learned).story
+    if config.data is not None:
+        return
     for stage, story in stories.items():
         _record(config, f"{config.garment}-{stage}.safetensors", story)
 
@@ -113,10 +119,11 @@ def _take_ready(config: ModelsConfig) -> None:
     config.work.mkdir(parents=True, exist_ok=True)
     for stage in STAGES[: max(STAGES.index(stage) for stage in config.stages)]:
         if stage not in config.stages:
-            ready = config.out / f"{config.garment}-{stage}.safetensors"
+            ready = (config.out if config.data is None else config.work) / f"{config.garment}-{stage}.safetensors"
             if not ready.is_file():
                 raise ValueError(f"{ready} is not there; train it as well (--stages {' '.join(STAGES)})")
-            shutil.copyfile(ready, config.work / ready.name)
+            if config.data is None:
+                shutil.copyfile(ready, config.work / ready.name)
 
 
 def further_motions(config: ModelsConfig) -> Path:
@@ -155,11 +162,12 @@ def ablation(config: ModelsConfig, suffix: str) -> None:
     """A row of Tab. 1: subspace and regressor of the same sizes and steps, without what the row leaves out."""
     if suffix not in ABLATIONS:
         raise ValueError(f"there is no ablation {suffix!r}; Tab. 1 has {', '.join(ABLATIONS)}")
-    data = config.subspace.data
+    data = config.data
     if suffix == ".2019":
         data = config.work / f"{config.garment}-constant.npz"
         if not data.is_file():
-            unposed_by_constant_weights(CanonicalSet.shipped(config.garment)).save(data)
+            whole = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
+            unposed_by_constant_weights(whole).save(data)
     here: dict[str, Any] = {"garment": config.garment, "out": config.work, "suffix": suffix, "data": data}
     train_subspace(replace(config.subspace, weights=ABLATIONS[suffix], **here))
     train_regressor(replace(config.regressor, **here))
@@ -167,7 +175,7 @@ def ablation(config: ModelsConfig, suffix: str) -> None:
 
 def unposed_by_constant_weights(data: CanonicalSet) -> CanonicalSet:
     """The training set in the space of earlier work: posed again, unposed with each vertex's constant rigging."""
-    body, garment = Body.default(), Garment.load(data.garment_name)
+    body, garment = Body.default(), data.garment
     model, projected = GarmentModel(body, GridFields.default()), []
     for s in data.sequences:
         parts = []
@@ -181,7 +189,7 @@ def unposed_by_constant_weights(data: CanonicalSet) -> CanonicalSet:
         )
         projected.append(Projected(X, bare))
     generator = torch.Generator().manual_seed(0)
-    return compact(projected, data.garment_name, data.fps, rank=data.rank, generator=generator)
+    return compact(projected, data.garment, data.fps, rank=data.rank, generator=generator)
 
 
 def _record(config: ModelsConfig, file: str, story: dict[str, Any]) -> None:

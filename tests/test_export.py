@@ -10,9 +10,11 @@ from workbench.formats.mesh_sequence import (
     DressedSequence,
     MeshSequence,
     read_dressed_sequence,
+    read_mesh,
     read_mesh_sequence,
     write_dressed_sequence,
 )
+from workbench.garments import Garment
 
 
 @pytest.fixture
@@ -44,6 +46,17 @@ def test_folders_hold_the_same_vertices(tmp_path, dressed, kind):
     for mesh in (dressed.body, dressed.garment):
         name = f"{mesh.name}.pc2" if kind == "pc2" else mesh.name
         np.testing.assert_array_equal(read_mesh_sequence(tmp_path / "out" / name).vertices, mesh.vertices)
+
+
+def test_the_body_and_a_garment_are_written_as_meshes_that_fit_each_other(tmp_path, body):
+    for word in ("body", "tshirt"):
+        assert cli.main(["export", word, "--out", str(tmp_path / f"{word}.obj")]) == 0
+    surface = read_mesh(tmp_path / "body.obj")
+    np.testing.assert_allclose(surface.vertices, body.template.numpy(), atol=1e-6)
+    (tmp_path / "tshirt.obj").rename(tmp_path / "mine.obj")
+    mine, shirt = Garment.load(tmp_path / "mine.obj"), Garment.load("tshirt")  # loading asks whether it fits the body
+    np.testing.assert_allclose(mine.vertices, shirt.vertices, atol=1e-6)
+    assert mine.faces.equal(shirt.faces)
 
 
 def test_every_nth_frame_keeps_the_speed(tmp_path, dressed):

@@ -17,7 +17,6 @@ from workbench.collisions.penetration import Penetration, penetration
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import Subspace
 from workbench.formats import load_motion, motion_files
-from workbench.garments import Garment
 from workbench.motion import Motion
 from workbench.tryon_demo import SHOWN
 
@@ -40,7 +39,7 @@ def regressor_view(
     The regressor sees every frame; every n-th is decoded, up to `frames` of them.
     """
     body, subspace = Body.default(), subspace or Subspace.shipped(regressor.garment_name)
-    garment = Garment.load(regressor.garment_name)
+    garment = subspace.garment
     shipped = {} if motion else {path.stem: path for path in motion_files(None)}
     names = tuple(shipped) or (motion.name if motion and motion.name else "motion",)
     which = Choice("motion", names, SHOWN if SHOWN in names else names[0])

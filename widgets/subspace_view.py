@@ -16,7 +16,6 @@ from widgets.scene import CLOTH, SKIN, Mesh, Points, Scalars, Scene, View, camer
 from workbench.body.model import Body
 from workbench.collisions.body_sdf import BodySDF, GridSDF
 from workbench.collisions.subspace import LATENTS, Subspace
-from workbench.garments import Garment
 from workbench.geometry.layer_count import LayerCount
 
 MILLI = 1e3
@@ -57,7 +56,7 @@ def subspace_view(subspace: Subspace, *others: Subspace, names: tuple[str, ...] 
     if len({one.vertex_count for one in shown}) > 1:
         counts = ", ".join(f"{one.garment_name!r} {one.vertex_count}" for one in shown)
         raise ValueError(f"the subspaces are of different garments ({counts} vertices); show each alone")
-    garment, body = Garment.load(subspace.garment_name), Body.default()
+    garment, body = subspace.garment, Body.default()
     sdf, layers = GridSDF.default(), LayerCount(body.template.numpy(), body.faces.numpy())
     body_mesh, faces = body.template.numpy(), body.faces.numpy()
 

@@ -14,12 +14,15 @@ from workbench.collisions.tryon_onnx import write_onnx
 from workbench.formats.gltf import dressed_meshes, write_glb
 from workbench.formats.mesh_sequence import (
     DressedSequence,
+    Mesh,
     MeshSequence,
     read_dressed_sequence,
     write_dressed_sequence,
+    write_mesh,
     write_mesh_folder,
     write_mesh_sequence,
 )
+from workbench.garments import Garment, shipped_garments
 from workbench.npz import read_npz
 
 Format = Literal["glb", "npz", "obj", "ply", "pc2"]
@@ -30,9 +33,10 @@ FORMATS: tuple[Format, ...] = ("glb", "npz", "obj", "ply", "pc2")
 class ExportConfig:
     """Write a body and its garment, moving, for other programs."""
 
-    # A dressed sequence (body_vertices, garment_vertices, ...) or a simulated one (rotations, garment, ...), .npz.
+    # A dressed sequence (body_vertices, garment_vertices, ...) or a simulated one (rotations, garment, ...), .npz; or
+    # `body`, or the name of a garment that ships: as one mesh, in rest pose, to fit garments of your own to.
     sequence: tyro.conf.Positional[Path]
-    # A .glb or .npz file; for obj, ply and pc2 a folder.
+    # A .glb or .npz file; for obj, ply and pc2 a folder; for `body` and garments an .obj or .ply file.
     out: Path
     # Taken from the suffix of `out` when absent.
     format: Format | None = None
@@ -40,6 +44,8 @@ class ExportConfig:
     every: int = 1
     # Write the networks of the garment named in place of SEQUENCE to the folder `out`, as ONNX.
     onnx: bool = False
+    # The folder of those networks (`workbench train`); those that ship when absent.
+    networks: Path | None = None
 
 
 def run(config: ExportConfig) -> list[Path]:
@@ -48,8 +54,12 @@ def run(config: ExportConfig) -> list[Path]:
     Raises ValueError for an unknown format or a file that holds no sequence, FileNotFoundError.
     """
     if config.onnx:
-        tryon = load_tryon(str(config.sequence), None)
+        tryon = load_tryon(str(config.sequence), config.networks)
         return write_onnx(config.out, tryon.regressor, tryon.subspace)
+    still = still_mesh(config.sequence)
+    if still is not None:
+        write_mesh(config.out, still)
+        return [config.out]
     kind = config.format or _format_of(config.out)
     if config.every < 1:
         raise ValueError(f"--every {config.every} keeps no frame: give 1 or more")
@@ -70,6 +80,19 @@ def run(config: ExportConfig) -> list[Path]:
             write_mesh_folder(target, mesh, f".{kind}")
         written.append(target)
     return written
+
+
+def still_mesh(source: Path) -> Mesh | None:
+    """The canonical body or a garment that ships, where that is what the word names and no such file is there."""
+    if source.exists():
+        return None
+    if str(source) == "body":
+        body = Body.default()
+        return Mesh(body.template.numpy(), body.faces.numpy())
+    if str(source) in shipped_garments():
+        garment = Garment.load(str(source))
+        return Mesh(garment.vertices.numpy(), garment.faces.numpy())
+    return None
 
 
 def read_any(path: Path) -> DressedSequence:

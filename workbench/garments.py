@@ -1,5 +1,6 @@
 """Sec. 4.3: a garment: template (draped on the mean body at rest) and material.  file or name -> (N,3), faces (M,3)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -62,6 +63,28 @@ class Garment:
                 f"garment {self.name!r}: inside out, {100 * (1 - outward):.0f} % of its area faces the body; "
                 "flip its faces"
             )
+
+    @property
+    def ships(self) -> bool:
+        """Whether this very garment is found by its name alone; others travel with what is trained for them."""
+        return self.name in shipped_garments() and self is _shipped(self.name)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All but the name, for files that hold more than the garment."""
+        named = {"vertices": self.vertices, "rest_vertices": self.rest_vertices, "faces": self.faces.int()}
+        return {f"garment.{key}": tensor for key, tensor in named.items()}
+
+    @staticmethod
+    def from_tensors(name: str, found: Mapping[str, Tensor]) -> "Garment | None":
+        """What `tensors` gave, or None where a file holds no garment.  Raises ValueError where half of it is there."""
+        keys = [f"garment.{key}" for key in ("vertices", "rest_vertices", "faces")]
+        missing = [key for key in keys if key not in found]
+        if len(missing) == len(keys):
+            return None
+        if missing:
+            raise ValueError(f"the file holds garment {name!r} without {', '.join(missing)}; make it again")
+        vertices, rest, faces = (found[key] for key in keys)
+        return Garment(name, vertices.float(), rest.float(), faces.long())
 
     def save(self, path: str | Path) -> None:
         """Own npz, float32, written whole or not at all."""

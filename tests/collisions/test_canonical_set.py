@@ -13,6 +13,7 @@ from workbench.collisions.canonical_set import (
     compact,
     principal_components,
 )
+from workbench.garments import Garment
 from workbench.geometry.rotations import axis_angle_to_matrix
 
 JOINTS, SHAPES, VERTICES = 4, 3, 50
@@ -37,9 +38,20 @@ def sequence(T: int, seed: int, split: str = "train") -> Projected:
     )
 
 
+def cloth() -> Garment:
+    """A strip of VERTICES vertices that does not ship."""
+    places = torch.arange(VERTICES)
+    vertices = torch.stack([places % 2, places // 2, 0 * places], dim=1).float()
+    corner = torch.arange(0, VERTICES - 2, 2)
+    faces = torch.cat(
+        [torch.stack([corner, corner + 1, corner + 2], 1), torch.stack([corner + 3, corner + 2, corner + 1], 1)]
+    )
+    return Garment("strip", vertices, 1.1 * vertices, faces)
+
+
 def small_set(rank: int = 6) -> tuple[CanonicalSet, list[Projected]]:
     made = [sequence(30, 0), sequence(20, 1), sequence(12, 2, "validation")]
-    return compact(made, "tshirt", 30.0, rank=rank, generator=torch.Generator().manual_seed(0)), made
+    return compact(made, cloth(), 30.0, rank=rank, generator=torch.Generator().manual_seed(0)), made
 
 
 def test_a_full_basis_gives_every_frame_back():
@@ -72,6 +84,9 @@ def test_round_trip_on_disk(tmp_path):
     data.save(tmp_path / "set.npz")
     back = CanonicalSet.load(tmp_path / "set.npz")
     assert (back.garment_name, back.fps, back.error) == (data.garment_name, data.fps, data.error)
+    assert back.garment.name == "strip"
+    for key, tensor in cloth().tensors().items():  # a garment that does not ship travels with its set
+        assert back.garment.tensors()[key].equal(tensor)
     for a, b in zip(data.sequences, back.sequences, strict=True):
         assert (a.motion_name, a.split) == (b.motion_name, b.split)
         torch.testing.assert_close(back.garments(b.coefficients), data.garments(a.coefficients), atol=5e-4, rtol=0)
@@ -97,7 +112,7 @@ def test_random_projection_finds_the_principal_directions():
 def test_sequences_of_different_garments_are_refused():
     a, b = sequence(5, 0), sequence(5, 1)
     with pytest.raises(ValueError, match="vertex counts"):
-        compact([a, Projected(b.canonical[:, :9], b.sequence)], "t", 30.0, rank=2, generator=torch.Generator())
+        compact([a, Projected(b.canonical[:, :9], b.sequence)], cloth(), 30.0, rank=2, generator=torch.Generator())
 
 
 def test_a_truncated_file_is_refused(tmp_path):

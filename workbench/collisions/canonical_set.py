@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from workbench.garments import Garment
 from workbench.geometry.rotations import matrix_to_quaternion, quaternion_to_matrix
 from workbench.npz import read_npz
 from workbench.store import atomic_write
@@ -65,6 +66,18 @@ class CanonicalSet:
     sequences: tuple[CanonicalSequence, ...]
     fps: float
     error: float  # metres, root mean square over the vertices of all kept frames, of basis and rounding
+    own_garment: Garment | None = None  # where it is none of those that ship
+
+    @cached_property
+    def garment(self) -> Garment:
+        """Template and topology.  Raises ValueError when the garment has another vertex count."""
+        garment = self.own_garment or Garment.load(self.garment_name)
+        if len(garment.vertices) != len(self.mean):
+            raise ValueError(
+                f"the training set has {len(self.mean)} vertices, but garment {self.garment_name!r} "
+                f"{len(garment.vertices)}; it was made for another garment"
+            )
+        return garment
 
     @property
     def rank(self) -> int:
@@ -127,6 +140,8 @@ class CanonicalSet:
             "fps": np.array(self.fps),
             "error": np.array(self.error),
         }
+        if self.own_garment is not None:
+            arrays |= {name: tensor.numpy() for name, tensor in self.own_garment.tensors().items()}
         with atomic_write(path) as part:
             np.savez_compressed(part, **arrays)
 
@@ -147,8 +162,10 @@ class CanonicalSet:
         if any(len(tensor) != sum(lengths) for tensor in whole):
             raise ValueError(f"{path}: its arrays hold {[len(t) for t in whole]} frames, its lengths {sum(lengths)}")
         parts = zip(*(tensor.split(lengths) for tensor in whole), strict=True)
+        name = str(arrays["garment"])
+        packed = {key: torch.from_numpy(value) for key, value in arrays.items() if key.startswith("garment.")}
         return CanonicalSet(
-            garment_name=str(arrays["garment"]),
+            garment_name=name,
             mean=torch.from_numpy(arrays["mean"]),
             basis=torch.from_numpy(basis).unflatten(1, (3, -1)).transpose(1, 2).contiguous(),
             sequences=tuple(
@@ -159,6 +176,7 @@ class CanonicalSet:
             ),
             fps=float(arrays["fps"]),
             error=float(arrays["error"]),
+            own_garment=Garment.from_tensors(name, packed),
         )
 
     @staticmethod
@@ -180,7 +198,7 @@ class Projected:
 
 
 def compact(
-    projected: Sequence[Projected], garment_name: str, fps: float, *, rank: int, generator: torch.Generator
+    projected: Sequence[Projected], garment: Garment, fps: float, *, rank: int, generator: torch.Generator
 ) -> CanonicalSet:
     """Mean and principal components of all kept frames given (training and validation, never test); coefficients.
 
@@ -195,7 +213,8 @@ def compact(
     frames = torch.cat(kept)
     mean = frames.mean(dim=0)
     basis = principal_components((frames - mean).flatten(1), rank, generator).unflatten(1, (-1, 3))
-    empty = CanonicalSet(garment_name, mean, basis, (), fps, 0.0)
+    own = None if garment.ships else garment
+    empty = CanonicalSet(garment.name, mean, basis, (), fps, 0.0, own)
     sequences = tuple(
         replace(one.sequence, coefficients=_rounded(empty.coefficients_of(one.canonical))) for one in projected
     )

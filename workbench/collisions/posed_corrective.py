@@ -30,7 +30,6 @@ from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import LATENTS, Subspace
 from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses, with_room
 from workbench.formats import load_motion, motion_files
-from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
 from workbench.learning.batches import random_rows
 from workbench.learning.fit import FitConfig, fit
@@ -209,13 +208,12 @@ class CorrectiveTraining:
 
     @cached_property
     def laplacian(self) -> Float[Tensor, "N N"]:
-        garment = Garment.load(self.data.garment_name)
-        return umbrella_laplacian(garment.faces, len(garment.vertices))
+        return umbrella_laplacian(self.data.garment.faces, len(self.data.mean))
 
     def unseen_joints(self) -> list[int]:
         """Joints that neither move the garment nor hang on one that does."""
-        body, garment = self.model.body, Garment.load(self.data.garment_name)
-        moves = self.model.fields.weights(garment.vertices).amax(dim=0) > MOVES
+        body = self.model.body
+        moves = self.model.fields.weights(self.data.garment.vertices).amax(dim=0) > MOVES
         return [joint for joint in range(1, len(moves)) if not (moves[joint] or moves[body.parents[joint]])]
 
     def wear(self, split: str) -> WornPoses:

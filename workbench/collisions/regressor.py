@@ -25,7 +25,6 @@ from workbench.collisions.motion_descriptor import (
     global_motion,
 )
 from workbench.collisions.subspace import LATENTS, SHIPPED, Subspace
-from workbench.garments import Garment
 from workbench.learning.batches import random_rows
 from workbench.learning.device import device_named
 from workbench.learning.fit import FitConfig, FitResult, fit
@@ -253,7 +252,7 @@ def fit_descriptor(training: RegressorTraining, work: Path) -> FitResult:
     config, body = training.config, training.body
     device = body.template.device
     generator = torch.Generator().manual_seed(config.seed + 3)
-    template = Garment.load(training.data.garment_name).vertices
+    template = training.data.garment.vertices
     chosen = template[torch.randperm(len(template), generator=generator)[:200]]
     weights, chosen = GridFields.default().at(chosen).weights.to(device), chosen.to(device)
     rotations = torch.cat([s.rotations for s in training.data.of_split("train")])

@@ -125,6 +125,13 @@ def shipped_sequences() -> list[SimulatedSequence]:
     return [SimulatedSequence.load(path) for path in sorted(SHIPPED.glob("*.npz"))]
 
 
+def tests_of(garment_name: str, folder: Path | None) -> list[SimulatedSequence]:
+    """The test sequences of a garment: those that ship, or those that `assets_gen dataset` left in a folder."""
+    if folder is None:
+        return shipped_tests(garment_name)
+    return [SimulatedSequence.load(path) for path in sorted(folder.glob(f"{garment_name}-test_*.npz"))]
+
+
 def shipped_tests(garment_name: str) -> list[SimulatedSequence]:
     """The simulated test sequences of a garment that ship, by file name; motions and shapes that no training saw."""
     return [SimulatedSequence.load(path) for path in sorted(SHIPPED_TESTS.glob(f"{garment_name}_*.npz"))]

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from workbench.collisions.body_sdf import BodySDF, GridSDF
@@ -211,6 +211,7 @@ class Subspace(nn.Module):
         super().__init__()
         generator = generator or torch.Generator().manual_seed(0)
         self.garment_name, self.config = garment_name, config
+        self.own_garment: Garment | None = None  # where it is none of those that ship
         self.encoder = Encoder(statistics, config, generator)
         self.decoder: Decoder | DenseDecoder = (Decoder if config.rank else DenseDecoder)(statistics, config, generator)
         self.story: dict = {}  # what made it: configuration, curves, scores
@@ -218,6 +219,17 @@ class Subspace(nn.Module):
     @property
     def vertex_count(self) -> int:
         return self.decoder.middle.numel() // 3
+
+    @property
+    def garment(self) -> Garment:
+        """Template and topology.  Raises ValueError when the garment has another vertex count."""
+        garment = self.own_garment or Garment.load(self.garment_name)
+        if len(garment.vertices) != self.vertex_count:
+            raise ValueError(
+                f"garment {garment.name!r} has {len(garment.vertices)} vertices, but its subspace "
+                f"{self.vertex_count}; train it again with `workbench train subspace`"
+            )
+        return garment
 
     def encode(self, X: Float[Tensor, "B N 3"]) -> Float[Tensor, "B L"]:
         """x_bar of canonical garments: the mean of E(X)."""
@@ -246,7 +258,8 @@ class Subspace(nn.Module):
             "network": json.dumps(asdict(self.config)),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata, coarse={"encoder.view": 0, "decoder.basis": LATENTS})
+        beside = self.own_garment.tensors() if self.own_garment is not None else {}
+        write_network(self, path, metadata, coarse={"encoder.view": 0, "decoder.basis": LATENTS}, beside=beside)
 
     @staticmethod
     def load(path: str | Path) -> "Subspace":
@@ -258,7 +271,8 @@ class Subspace(nn.Module):
         config = NetworkConfig(**json.loads(metadata["network"]))
         blank = Statistics.blank(int(metadata["vertices"]), config)
         subspace = Subspace(metadata["garment"], blank, config)
-        subspace.load_state_dict(found.tensors)
+        subspace.own_garment = Garment.from_tensors(subspace.garment_name, found.tensors)
+        subspace.load_state_dict({key: t for key, t in found.tensors.items() if not key.startswith("garment.")})
         subspace.story = json.loads(metadata["story"])
         return subspace.eval()
 
@@ -345,11 +359,11 @@ class SubspaceTraining:
         """What does not depend on the device is made on the CPU, alike for all, then moved."""
         device = device_named(config.device)
         data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(config.garment)
-        faces = garment_faces(data)
         network = replace(config.network, rank=min(config.network.rank, data.rank))
         generator = torch.Generator().manual_seed(config.seed)
         subspace = Subspace(data.garment_name, Statistics.of(data, network), network, generator)
-        laplacian = umbrella_laplacian(faces, len(data.mean)).to(device)
+        subspace.own_garment = data.own_garment
+        laplacian = umbrella_laplacian(data.garment.faces, len(data.mean)).to(device)
         loss = SubspaceLoss(GridSDF.default().to(device), laplacian, config.weights)
         return SubspaceTraining(config, data.to(device), subspace.to(device), loss)
 
@@ -424,17 +438,6 @@ def measure(training: SubspaceTraining, frames: int = 256, samples: int = 256) -
 def share_inside(sdf: Callable[[Tensor], Tensor], X: Float[Tensor, "B N 3"]) -> float:
     """Vertices inside the canonical body, percent."""
     return 100 * float((sdf(X) < 0).float().mean())
-
-
-def garment_faces(data: CanonicalSet) -> Int[Tensor, "F 3"]:
-    """The topology of the set's garment.  Raises ValueError when the garment has another vertex count."""
-    garment = Garment.load(data.garment_name)
-    if len(garment.vertices) != len(data.mean):
-        raise ValueError(
-            f"the training set has {len(data.mean)} vertices, but garment {data.garment_name!r} "
-            f"{len(garment.vertices)}; it was made for another garment"
-        )
-    return garment.faces
 
 
 def _plain(config: TrainSubspaceConfig) -> dict:

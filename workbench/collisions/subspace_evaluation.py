@@ -14,8 +14,8 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.penetration import penetration
 from workbench.collisions.projection import Projector
-from workbench.collisions.sequences import shipped_tests
-from workbench.collisions.subspace import SHIPPED, Subspace, garment_faces
+from workbench.collisions.sequences import tests_of
+from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.evaluation_table import Row, at_most, told, within
 from workbench.garments import Garment
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
@@ -31,6 +31,8 @@ class SubspaceEvaluation:
 
     garments: tuple[str, ...] = ()  # by default all whose subspace ships
     networks: Path | None = None  # a folder of subspaces; those that ship when absent
+    data: Path | None = None  # the training set of one garment (`python -m assets_gen dataset`); what ships when absent
+    sequences: Path | None = None  # a folder with simulated test sequences, of the same command; what ships when absent
     samples: int = 1000  # garments decoded from N(0, I)
     test_sequences: int = 6  # how many of the shipped test sequences are projected and reconstructed
     seed: int = 5
@@ -56,12 +58,17 @@ def trained_garments(folder: Path) -> tuple[str, ...]:
 def garment_rows(name: str, config: SubspaceEvaluation) -> list[Row]:
     """One garment: unseen frames there and back, garments drawn from N(0, I), exact winding numbers."""
     subspace = Subspace.load((config.networks or SHIPPED) / f"{name}-subspace.safetensors")
-    data, body, sdf = CanonicalSet.shipped(name), Body.default(), GridSDF.default()
-    laplacian = umbrella_laplacian(garment_faces(data), len(data.mean))
+    data = CanonicalSet.load(config.data) if config.data else CanonicalSet.shipped(name)
+    if data.garment_name != name:
+        raise ValueError(
+            f"{config.data} is of garment {data.garment_name!r}, the subspace of {name!r}; name one garment"
+        )
+    body, sdf = Body.default(), GridSDF.default()
+    laplacian = umbrella_laplacian(data.garment.faces, len(data.mean))
     table = [told(f"{name}: compact training set, RMS loss", MILLI * data.error, "mm")]
     for split in ("train", "validation", "test"):
         X = (
-            unseen_garments(name, config.test_sequences)
+            unseen_garments(subspace.garment, config.test_sequences, config.sequences)
             if split == "test"
             else data.garments(_thinned(data.kept(split), 1500))
         )
@@ -88,19 +95,24 @@ def garment_rows(name: str, config: SubspaceEvaluation) -> list[Row]:
     return table + curve_rows(name, subspace)
 
 
-def unseen_garments(name: str, sequences: int, every: int = 4) -> Float[Tensor, "B N 3"]:
-    """The test sequences that ship, projected here and now: canonical garments that no training and no basis saw."""
-    garment = Garment.load(name)
+def unseen_garments(
+    garment: Garment, sequences: int, folder: Path | None = None, every: int = 4
+) -> Float[Tensor, "B N 3"]:
+    """The test sequences that ship (or of a folder), projected here and now: canonical garments that no training and no
+    basis saw."""
     rest = rest_triangles(garment.rest_vertices, garment.faces)
     model = GarmentModel(Body.default(), GridFields.default())
     projector = Projector(model, GridSDF.default(), rest, garment.vertices)
     found = []
-    for s in shipped_tests(name)[:sequences]:
+    for s in tests_of(garment.name, folder)[:sequences]:
         state = model.state(s.rotations, s.betas, s.translation)
         X = projector.unskin(s.garment, state).canonical
         found.append(X[s.valid][::every])
     if not found:
-        raise ValueError(f"no test sequence of garment {name!r} ships; make some: python -m assets_gen dataset --ship")
+        raise ValueError(
+            f"there is no test sequence of garment {garment.name!r} in {folder or 'what ships'}; make some with "
+            "`python -m assets_gen dataset` and pass its folder with --sequences"
+        )
     return torch.cat(found)
 
 

@@ -133,12 +133,7 @@ class TryOn:
                 f"the subspace is of garment {subspace.garment_name!r}, but the regressor of "
                 f"{regressor.garment_name!r}; load a pair that was trained together"
             )
-        garment = Garment.load(subspace.garment_name)
-        if len(garment.vertices) != subspace.vertex_count:
-            raise ValueError(
-                f"garment {garment.name!r} has {len(garment.vertices)} vertices, but its subspace "
-                f"{subspace.vertex_count}; train it again with `workbench train subspace`"
-            )
+        garment = subspace.garment
         joints = len(model.body.parents)
         if joints != regressor.joints:
             raise ValueError(f"the body has {joints} joints, but the regressor was trained for {regressor.joints}")
@@ -287,7 +282,7 @@ def checked_shape(betas: Float[Tensor, "_"], body: Body) -> Float[Tensor, "K"]:
 class TryOnConfig:
     """Dress a body in a garment through any motion file."""
 
-    # The name of a garment whose networks ship, such as tshirt.
+    # The name of a garment whose networks ship, such as tshirt, or of one whose networks are in --networks.
     garment: tyro.conf.Positional[str]
     # BVH, AMASS npz, or our own npz.
     motion: Path

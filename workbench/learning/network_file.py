@@ -30,13 +30,19 @@ class NetworkFile:
 
 
 def write_network(
-    network: nn.Module, path: Path, metadata: Mapping[str, str], coarse: Mapping[str, int] = MappingProxyType({})
+    network: nn.Module,
+    path: Path,
+    metadata: Mapping[str, str],
+    coarse: Mapping[str, int] = MappingProxyType({}),
+    beside: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
     """Parameters and buffers, whole or not at all; matrices named in `coarse` as int8, but for so many first rows.
 
+    `beside`: what else the file is to hold, as it is.
+
     Under torchrun the first process writes, and all wait until it has.
     """
-    tensors = {}
+    tensors = {name: tensor.contiguous() for name, tensor in beside.items()}
     for name, parameter in network.state_dict().items():
         tensor = parameter.detach().cpu()
         if name in coarse and tensor.dim() == 2:
