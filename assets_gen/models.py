@@ -98,7 +98,8 @@ def run(config: ModelsConfig) -> None:
     if "regressor" in config.stages:
         stories["regressor"] = train_regressor(replace(config.regressor, **here)).story
     if "corrective" in config.stages:
-        motions = (further_motions(config), *([lifted_motions(config)] if config.lifted else []))
+        further = (further_motions(config),) if config.further or config.further_lively else ()
+        motions = (*further, *([lifted_motions(config)] if config.lifted else []))
         uncleared = (loose_motions(config),) if config.loose else ()
         weights = config.corrective.weights
         if weights == CorrectiveWeights():

@@ -3,6 +3,7 @@
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -173,6 +174,10 @@ def test_the_judge_sees_vertices_inside_and_torn_cloth(ball, cap):
     sunk[5] *= 0.9
     assert judge(sunk.numpy(), ball.template.numpy()).inside == 1
     assert not judge(sunk.numpy(), ball.template.numpy()).valid
+    allowed = replace(judge, record=replace(QUICK, most_inside=1.5 / len(sunk)))
+    assert allowed(sunk.numpy(), ball.template.numpy()).valid
+    sunk[6] *= 0.9
+    assert not allowed(sunk.numpy(), ball.template.numpy()).valid
     torn = judge((cap.vertices * 2.5).numpy(), ball.template.numpy())
     assert torn.usual_stretch == pytest.approx(2.5, rel=1e-3)
     assert not torn.valid
