@@ -15,16 +15,8 @@ from workbench.formats.amass import smpl_t_pose
 from workbench.formats.bvh import read_bvh, write_bvh
 from workbench.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rotation_angle
 from workbench.motion import Motion
-from workbench.retargeting import (
-    CONVENTIONS,
-    REQUIRED_ROLES,
-    RetargetConfig,
-    grounded,
-    reframed,
-    reframed_skeleton,
-    retarget,
-    roles_of,
-)
+from workbench.retargeting import RetargetConfig, grounded, reframed, reframed_skeleton, retarget
+from workbench.rig_names import CONVENTIONS, REQUIRED_ROLES, roles_of
 
 LIMB_BONES = [
     (side + start, side + end)
@@ -115,7 +107,30 @@ RIGS = {
     "Mixamo": {"convention": "Mixamo"},
     "Mixamo with prefix": {"convention": "Mixamo", "prefix": "mixamorig:"},
     "SMPL": {"convention": "SMPL"},
+    "Biovision": {"convention": "Biovision"},
+    "Unity": {"convention": "Unity / VRM"},
+    "Unity, side last": {"convention": "Unity, side last"},
+    "Xsens": {"convention": "Xsens MVN"},
+    "Unreal": {"convention": "Unreal"},
+    "Rigify": {"convention": "Blender Rigify"},
+    "Biped": {"convention": "3ds Max Biped", "prefix": "Bip01_"},
+    "Acclaim": {"convention": "Acclaim"},
 }
+
+
+def test_every_convention_is_tried_here():
+    assert {one["convention"] for one in RIGS.values()} == set(CONVENTIONS)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_no_convention_gives_a_joint_two_roles_or_a_side_the_names_of_the_other(side):
+    other = {"left": "Right", "right": "Left"}[side]
+    for convention, table in CONVENTIONS.items():
+        first = [names[0].lower() for names in table.values()]
+        if convention != "DAZ / Poser":  # its generations split the spine differently
+            assert len(set(first)) == len(first), convention
+        mine = {name for role, names in table.items() if role.startswith(side.title()) for name in names}
+        assert not mine & {name for role, names in table.items() if role.startswith(other) for name in names}
 
 
 @pytest.fixture(params=RIGS)

@@ -10,7 +10,6 @@ A joint without counterpart keeps its rest rotation relative to its parent.
 
 import logging
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,6 +23,7 @@ from workbench.body.skeleton import Skeleton
 from workbench.body.skinning import forward_kinematics
 from workbench.geometry.rotations import axis_angle_to_matrix, rotation_angle, smallest_rotation
 from workbench.motion import Motion
+from workbench.rig_names import SIDES, roles_of
 
 log = logging.getLogger(__name__)
 
@@ -61,150 +61,6 @@ class RetargetConfig:
     largest_twist: float = 60.0
     planted_speed: float = 0.2
     largest_slope: float = 15.0
-
-
-# Names: a role is a joint of the default rig (cmu_mb); a convention says what others call it, best name first.
-
-_SIDES = ("Left", "Right")
-_LIMBS = ("UpLeg", "Leg", "Foot", "Arm", "ForeArm", "Hand")
-REQUIRED_ROLES = ("Hips", *(side + limb for side in _SIDES for limb in _LIMBS))
-
-
-def _sided(left: Mapping[str, str], from_left: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    """A table with both sides, from that of the left side and what turns left names into right ones."""
-
-    def right(name: str) -> str:
-        for old, new in from_left.items():
-            if name.startswith(old):
-                return new + name[len(old) :]
-        return name
-
-    both = {role: tuple(names.split()) for role, names in left.items()}
-    for role, names in left.items():
-        other = "Right" + role[4:] if role.startswith("Left") else "R" + role[1:] if role[:2] in ("LH", "LT") else role
-        both.setdefault(other, tuple(right(name) for name in names.split()))
-    return both
-
-
-CONVENTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
-    "CMU / MotionBuilder": _sided(
-        {
-            **{
-                role: role
-                for role in ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LHipJoint", "LThumb")
-            },
-            **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "ToeBase", "Shoulder", "FingerBase")},
-            "LeftHandFinger1": "LeftHandFinger1 LFingers LeftHandIndex1",
-        },
-        {"Left": "Right", "L": "R"},
-    ),
-    "Mixamo": _sided(
-        {
-            "Hips": "Hips",
-            "LowerBack": "Spine",
-            "Spine": "Spine1",
-            "Spine1": "Spine2",
-            "Neck": "Neck",
-            "Head": "Head",
-            **{f"Left{part}": f"Left{part}" for part in (*_LIMBS, "Shoulder")},
-            "LeftToeBase": "LeftToeBase LeftToe",
-            "LeftFingerBase": "LeftHandMiddle1",
-            "LeftHandFinger1": "LeftHandMiddle2",
-            "LThumb": "LeftHandThumb1",
-        },
-        {"Left": "Right"},
-    ),
-    "DAZ / Poser": _sided(
-        {
-            "Hips": "hip",
-            "LowerBack": "abdomen abdomenLower",
-            "Spine": "chest abdomenUpper",
-            "Spine1": "chestUpper chestLower",
-            "Neck": "neck neckLower",
-            "Neck1": "neckUpper",
-            "Head": "head",
-            "LeftUpLeg": "lThigh lThighBend",
-            "LeftLeg": "lShin",
-            "LeftFoot": "lFoot",
-            "LeftToeBase": "lToe lToes",
-            "LeftShoulder": "lCollar",
-            "LeftArm": "lShldr lShldrBend",
-            "LeftForeArm": "lForeArm lForearmBend",
-            "LeftHand": "lHand",
-            "LeftFingerBase": "lMid1",
-            "LeftHandFinger1": "lMid2",
-            "LThumb": "lThumb1",
-        },
-        {"l": "r"},
-    ),
-    "SMPL": _sided(
-        {
-            "Hips": "pelvis",
-            "LowerBack": "spine1",
-            "Spine": "spine2",
-            "Spine1": "spine3",
-            "Neck": "neck",
-            "Head": "head",
-            "LeftUpLeg": "left_hip L_Hip",
-            "LeftLeg": "left_knee L_Knee",
-            "LeftFoot": "left_ankle L_Ankle",
-            "LeftToeBase": "left_foot L_Foot",
-            "LeftShoulder": "left_collar L_Collar",
-            "LeftArm": "left_shoulder L_Shoulder",
-            "LeftForeArm": "left_elbow L_Elbow",
-            "LeftHand": "left_wrist L_Wrist",
-            "LeftFingerBase": "left_hand left_middle1 L_Hand",
-        },
-        {"left": "right", "L_": "R_"},
-    ),
-}
-
-
-def _plain(name: str) -> str:
-    """A joint name without namespace ('mixamorig:', 'mixamorig1_', 'm_avg_'), in small letters."""
-    return re.sub(r"^(?:.*:|mixamorig\d*_|[mf]_avg_)", "", name).lower()
-
-
-def roles_of(skeleton: Skeleton, mapping: Mapping[str, str] | None = None) -> dict[str, int]:
-    """Which joint plays which role (joint name of the default rig -> index), by the best fitting convention.
-
-    mapping {role: joint name} adds to it and overrides it.  Raises ValueError listing the required roles that no joint
-    plays, or the entries of mapping that name nothing.
-    """
-    joints = {_plain(name): j for j, name in reversed(list(enumerate(skeleton.names)))}
-
-    def recognised(table: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
-        found = {
-            role: next((joints[n.lower()] for n in names if n.lower() in joints), -1) for role, names in table.items()
-        }
-        return {role: j for role, j in found.items() if j >= 0}
-
-    best_name, best = max(
-        ((name, recognised(table)) for name, table in CONVENTIONS.items()),
-        key=lambda entry: (sum(role in entry[1] for role in REQUIRED_ROLES), len(entry[1])),
-    )
-    roles = dict(best)
-    for role, name in (mapping or {}).items():
-        if role not in CONVENTIONS["CMU / MotionBuilder"]:
-            raise ValueError(
-                f"mapping names the role {role!r}; roles are {', '.join(CONVENTIONS['CMU / MotionBuilder'])}"
-            )
-        if name not in skeleton.names:
-            raise ValueError(
-                f"mapping takes {role} from the joint {name!r}, but the motion has {', '.join(skeleton.names)}"
-            )
-        roles[role] = skeleton.index(name)
-    missing = [role for role in REQUIRED_ROLES if role not in roles]
-    if missing:
-        raise ValueError(
-            f"these joint names follow none of the known conventions ({', '.join(CONVENTIONS)}; nearest: {best_name}): "
-            f"no joint was found for {', '.join(missing)}; the joints are {', '.join(skeleton.names)}; "
-            f"pass mapping={{role: joint name}} for what is missing"
-        )
-    return roles
-
-
-# Frames of reference
 
 
 def reframed(motion: Motion, turn: Float[Tensor, "3 3"], scale: float = 1.0) -> Motion:
@@ -366,7 +222,7 @@ def rest_alignment(
     """
     backward, forward = -torch.tensor(_FORWARD, dtype=torch.float64), torch.tensor(_FORWARD, dtype=torch.float64)
     A: dict[str, Tensor] = {}
-    for side in _SIDES:
+    for side in SIDES:
         for chain, fold in ((("Arm", "ForeArm", "Hand", "FingerBase"), forward), (("UpLeg", "Leg", "Foot"), backward)):
             first, second, third = (side + part for part in chain[:3])
             bones = []
@@ -427,7 +283,7 @@ def t_pose_frames(
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     at_rest = torch.ones(len(world), dtype=torch.bool)
     arms = []
-    for side, lateral in zip(_SIDES, (1.0, -1.0)):
+    for side, lateral in zip(SIDES, (1.0, -1.0)):
         for role, next_role in (("Arm", "ForeArm"), ("ForeArm", "Hand"), ("UpLeg", "Leg"), ("Leg", "Foot")):
             bone = _bone_direction(source, roles, side + role, side + next_role)
             if bone is None:
@@ -533,9 +389,9 @@ def retarget(
 
     scale = _leg_length(target, target_roles) / _leg_length(source, source_roles)
     rest = target.rest_joints.double()
-    hips = [target_roles[side + "UpLeg"] for side in _SIDES]
+    hips = [target_roles[side + "UpLeg"] for side in SIDES]
     posed = forward_kinematics(rotations, rest, target.parents)
-    source_middle = places[:, [source_roles[side + "UpLeg"] for side in _SIDES]].mean(1)
+    source_middle = places[:, [source_roles[side + "UpLeg"] for side in SIDES]].mean(1)
     root = scale * source_middle - (posed.joints[:, hips].mean(1) - rest[0])
 
     # Back to the axes of the target's own rest; its root then stands the body up in the world.
@@ -558,7 +414,7 @@ def _turn_up(axis: Axis) -> Float[Tensor, "3 3"]:
 def _leg_length(skeleton: Skeleton, roles: Mapping[str, int]) -> float:
     """Thigh and shin, mean of both sides."""
     rest, total = skeleton.rest_joints.double(), 0.0
-    for side in _SIDES:
+    for side in SIDES:
         hip, knee, ankle = (rest[roles[side + part]] for part in ("UpLeg", "Leg", "Foot"))
         total += float((knee - hip).norm() + (ankle - knee).norm())
-    return total / len(_SIDES)
+    return total / len(SIDES)
