@@ -109,7 +109,7 @@ RIGS = {
     "SMPL": {"convention": "SMPL"},
     "Biovision": {"convention": "Biovision"},
     "Unity": {"convention": "Unity / VRM"},
-    "Unity, side last": {"convention": "Unity, side last"},
+    "Bandai Namco": {"convention": "Bandai Namco"},
     "Xsens": {"convention": "Xsens MVN"},
     "Unreal": {"convention": "Unreal"},
     "Rigify": {"convention": "Blender Rigify"},
@@ -399,7 +399,8 @@ def test_unknown_names_are_refused_with_what_is_missing_and_mended_by_a_mapping(
     )
     write_bvh(tmp_path / "odd.bvh", odd)
     with pytest.raises(
-        ValueError, match=r"odd\.bvh.*no joint was found for Hips, LeftLeg; the joints are .*KneeL.*mapping"
+        ValueError,
+        match=r"odd\.bvh.*no joint was found for Hips, LeftLeg; the joints are .*KneeL.*motions\.notes\.json",
     ):
         load_motion(tmp_path / "odd.bvh", body)
     mapping = {"LeftLeg": "KneeL", "Hips": "Basin"}

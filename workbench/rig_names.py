@@ -145,8 +145,8 @@ CONVENTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         },
         {"Left": "Right"},
     ),
-    # The same with the side at the end: the Bandai Namco data set
-    "Unity, side last": _sided(
+    # Unity's words with the side at the end
+    "Bandai Namco": _sided(
         {
             "Hips": "Hips",
             "LowerBack": "Spine",
@@ -279,7 +279,7 @@ def roles_of(skeleton: Skeleton, mapping: Mapping[str, str] | None = None) -> di
         raise ValueError(
             f"these joint names follow none of the known conventions ({', '.join(CONVENTIONS)}; nearest: {best_name}): "
             f"no joint was found for {', '.join(missing)}; the joints are {', '.join(skeleton.names)}; "
-            f"pass mapping={{role: joint name}} for what is missing"
+            'write {"joints": {role: joint name}} for what is missing into motions.notes.json beside the file'
         )
     return roles
 

@@ -10,6 +10,7 @@ from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
 from workbench.formats.amass import amass_motion, is_amass, read_arrays, smpl_t_pose
 from workbench.formats.bvh import read_bvh
+from workbench.formats.motion_notes import notes_beside
 from workbench.motion import Motion, is_own_motion
 from workbench.retargeting import RetargetConfig, grounded, retarget
 
@@ -43,11 +44,14 @@ def load_motion(
     Our own files for this very body come as they were saved.
 
     The frame rate is that of the file; fps says what it really is where the file is wrong (it does not resample:
-    `Motion.resampled` does).  mapping {role: joint} names joints that no known convention has (see `retargeting`).
+    `Motion.resampled` does).  mapping {role: joint} names joints that no known convention has (see `rig_names`).
+    What is not said here is taken from a note beside the file, where there is one (see `motion_notes`).
     Raises FileNotFoundError, or ValueError naming the file and what is wrong with it.
     """
     path = Path(path)
     kind = path.suffix.lower()
+    notes = notes_beside(path)
+    fps, mapping = notes.fps if fps is None else fps, notes.joints if mapping is None else mapping
     if kind == ".bvh":
         motion = read_bvh(path, fps=fps)
     elif kind == ".npz":
