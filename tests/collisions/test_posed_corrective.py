@@ -9,11 +9,13 @@ import torch
 
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
+    REACH,
     CorrectiveTraining,
     PosedCorrective,
     TrainCorrectiveConfig,
     run,
     train,
+    within_reach,
 )
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
@@ -70,6 +72,16 @@ def test_it_begins_by_correcting_nothing_and_does_not_see_the_root(body):
     bent = pose.clone()
     bent[:, 5] = turned[:, 0]
     assert float((corrective(bent, *given) - corrective(pose, *given)).abs().max()) > 0
+
+
+def test_an_offset_beyond_its_reach_keeps_its_direction_and_loses_the_rest():
+    offset = torch.randn(5, 50, 3, generator=torch.Generator().manual_seed(0))
+    wanted = torch.tensor([0.0, 0.3, 0.99, 1.5, 40.0]) * REACH
+    sized = offset * (wanted / offset.square().sum(-1).mean(-1).sqrt())[:, None, None]
+    held = sized * within_reach(sized)[:, None, None]
+    torch.testing.assert_close(held.square().sum(-1).mean(-1).sqrt(), wanted.clamp(max=REACH), atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(held[:3], sized[:3])
+    torch.testing.assert_close(held[3:] / REACH, sized[3:] / wanted[3:, None, None], atol=1e-4, rtol=1e-4)
 
 
 def test_what_is_needed_brings_vertices_out(config, body):

@@ -81,9 +81,10 @@ def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
     assert quickest(fresh).networks is fresh.networks
 
 
-def test_a_corrective_in_kernels_gives_what_torch_gives(tryon):
+@pytest.mark.parametrize("size", [5, 500])  # 500: far beyond its reach
+def test_a_corrective_in_kernels_gives_what_torch_gives(tryon, size):
     chance = torch.Generator().manual_seed(2)
-    corrective = PosedCorrective("tshirt", 31, 10, 5 * torch.randn(16, 3 * 4630, generator=chance), 64, chance)
+    corrective = PosedCorrective("tshirt", 31, 10, size * torch.randn(16, 3 * 4630, generator=chance), 64, chance)
     with torch.no_grad():
         for parameter in corrective.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=chance)

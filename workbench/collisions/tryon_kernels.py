@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
-from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, PosedCorrective
+from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, PosedCorrective, within_reach
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, Subspace
 from workbench.collisions.tryon import Networks, TryOn
@@ -145,7 +145,8 @@ class KernelCorrective:
         np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
         for call in (*self.trunk.calls, self.spread.call):
             call()
-        return torch.from_numpy(self.spread.outputs / np.float32(MILLI)).reshape(-1, 3)
+        offset = torch.from_numpy(self.spread.outputs / np.float32(MILLI)).reshape(-1, 3)
+        return offset * within_reach(offset)
 
 
 def quickest(tryon: TryOn) -> TryOn:

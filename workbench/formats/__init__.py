@@ -1,5 +1,6 @@
 """Files of others, one format a module, and load_motion: any motion file -> Motion on a body's skeleton."""
 
+import logging
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -12,10 +13,12 @@ from workbench.formats.amass import amass_motion, is_amass, read_arrays, smpl_t_
 from workbench.formats.bvh import read_bvh
 from workbench.formats.motion_notes import notes_beside
 from workbench.motion import Motion, is_own_motion
+from workbench.motion_doubts import doubtful_spine
 from workbench.retargeting import RetargetConfig, grounded, retarget
 
 __all__ = ["load_motion", "motion_files"]
 
+log = logging.getLogger(__name__)
 SUFFIXES = (".bvh", ".npz")
 
 
@@ -72,9 +75,13 @@ def load_motion(
             f"{path}: motions are read from .bvh (any known rig) and .npz (AMASS, ours) files, not {kind!r}"
         )
     try:
-        return grounded(retarget(motion, body.skeleton, mapping=mapping, config=config), body)
+        carried = grounded(retarget(motion, body.skeleton, mapping=mapping, config=config), body)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    doubt = doubtful_spine(carried)
+    if doubt is not None:
+        log.warning("%s: %s", path, doubt)
+    return carried
 
 
 def _is_made_for(motion: Motion, body: Body) -> bool:
