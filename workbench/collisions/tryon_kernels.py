@@ -5,6 +5,7 @@ float16; here they stay so, sums are in float32: torch's numbers from half the b
 """
 
 import contextlib
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
-from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, PosedCorrective, within_reach
+from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, REACH, PosedCorrective
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, Subspace
 from workbench.collisions.tryon import Networks, TryOn
@@ -145,8 +146,9 @@ class KernelCorrective:
         np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
         for call in (*self.trunk.calls, self.spread.call):
             call()
-        offset = torch.from_numpy(self.spread.outputs / np.float32(MILLI)).reshape(-1, 3)
-        return offset * within_reach(offset)
+        flat = self.spread.outputs
+        size = math.sqrt(3 * float(flat @ flat) / len(flat)) / MILLI  # metres: `within_reach` of one frame
+        return torch.from_numpy(flat * np.float32(REACH / max(size, REACH) / MILLI)).reshape(-1, 3)
 
 
 def quickest(tryon: TryOn) -> TryOn:
