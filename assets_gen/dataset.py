@@ -132,9 +132,9 @@ def chosen(planned: list[PlannedSequence], only: Sequence[str]) -> list[PlannedS
     return [one for one in planned if not only or one.motion in only]
 
 
-def simulated(config: DatasetConfig, body: Body) -> tuple[list[PlannedSequence], list[Path | None]]:
+def simulated(config: DatasetConfig, body: Body, garment: Garment) -> tuple[list[PlannedSequence], list[Path | None]]:
     """The files of the plan, made where they are missing (None where a simulation failed)."""
-    planned, garment = chosen(plan(config, body), config.only), asked_garment(config, body)
+    planned = chosen(plan(config, body), config.only)
     tasks = [_task(config, body, garment, one) for one in planned]
     request = SimulationsConfig(
         out=config.out, workers=config.workers, scheduler=config.scheduler, record=config.record
@@ -172,7 +172,7 @@ def run(config: DatasetConfig) -> None:
     """Simulate and project what is missing, report every sequence, write the compact set (not of a chosen few)."""
     body = Body.default()
     garment = asked_garment(config, body)
-    planned, paths = simulated(config, body)
+    planned, paths = simulated(config, body, garment)
     made = [(one, path) for one, path in zip(planned, paths, strict=True) if path is not None]
     for _, path in made:
         print(report_line(path))

@@ -40,7 +40,7 @@ class PointModelsConfig:
     # Where training keeps its state.
     work: Path = Path("out/points")
     pop: TrainPointsConfig = TrainPointsConfig()
-    # As many steps as take each outfit about as long as POP takes an outfit: about 260 CPU-s.
+    # As many steps as take each outfit about as long as POP takes an outfit: about 310 CPU-s.
     patches: TrainPointsConfig = TrainPointsConfig(
         method="patches", outfits="tshirt,dress", training=PointTrainingConfig(fit=replace(STEPS, steps=2760))
     )
