@@ -64,7 +64,7 @@ class SimulationsConfig:
     """Simulate garments over motions; without --motion the default set."""
 
     motion: str | None = None
-    """a motion file (BVH, AMASS npz, our npz), or the name of a generated motion such as walk_00"""
+    """a motion file (BVH, AMASS npz, DeepMimic txt, our npz), or the name of a generated motion such as walk_00"""
     garment: str = "tshirt"
     """a shipped garment's name, or an OBJ, PLY or npz file (with --motion)"""
     betas: tuple[float, ...] = ()

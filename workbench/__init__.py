@@ -7,7 +7,7 @@ The map
 | stage               | section | eq.  | module                           | in -> out                            |
 |---------------------|---------|------|----------------------------------|--------------------------------------|
 | body                | 3       | 2-3  | workbench.body.model             | theta, beta -> M_B (V,3)             |
-| motion              |         |      | workbench.motion                 | BVH, AMASS -> theta (T,J,3,3)        |
+| motion              |         |      | workbench.motion                 | BVH, AMASS, .. -> theta (T,J,3,3)    |
 | garment             |         |      | workbench.garments               | file -> template (N,3), faces (F,3)  |
 | simulated sequences | 6       |      | workbench.collisions.sequences   | theta, beta -> M_G (T,N,3)           |
 | diffused body       | 4.1     | 4-6  | workbench.collisions.diffused_body | p (N,3) -> W~, B~s, B~p            |

@@ -61,6 +61,10 @@ class Motion:
         # Rates such as 1 / 0.0083333 are printed short: a time this near a frame is that frame.
         nearest = position.round()
         position = torch.where((position - nearest).abs() < 1e-3, nearest, position).clamp(max=len(self) - 1)
+        return replace(self.between_frames(position), fps=float(fps))
+
+    def between_frames(self, position: Float[Tensor, "S"]) -> "Motion":
+        """The motion at S places 0 <= position <= T - 1 between its frames, as frames of the same rate."""
         before = position.floor().long()
         after = (before + 1).clamp(max=len(self) - 1)
         fraction = position - before
@@ -74,7 +78,7 @@ class Motion:
             rotations[between] = turned.to(rotations.dtype)
             moved = torch.lerp(self.translation[before].double(), self.translation[after].double(), fraction[:, None])
             translation[between] = moved.to(translation.dtype)
-        return replace(self, rotations=rotations, translation=translation, fps=float(fps))
+        return replace(self, rotations=rotations, translation=translation)
 
     def at_rate(self, fps: float) -> "Motion":
         """The same frames played at another rate, for files whose rate is wrong."""

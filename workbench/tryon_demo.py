@@ -30,7 +30,7 @@ class TryOnDemoConfig:
 
     out: Path = Path("out/demo")
     garment: str = "tshirt"
-    # A motion file (BVH, AMASS npz, own npz), or the name of a test motion that ships.
+    # A motion file (BVH, AMASS npz, DeepMimic txt, own npz), or the name of a test motion that ships.
     motion: str = SHOWN
     # The shape to dress, up to 10 numbers in standard deviations, with commas.
     betas: str = "0.8,-1.0,-1.2,0.6"

@@ -17,7 +17,9 @@ from workbench.collisions.tryon_kernels import KernelNetworks
 from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.extras import MissingExtra
 from workbench.formats import load_motion, motion_files
+from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.motion import Motion
+from workbench.motion_doubts import mended
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +93,20 @@ def test_a_motion_of_nan_is_refused_before_it_is_dressed(motion):
     rotations[3] = torch.nan
     with pytest.raises(ValueError, match="rotations must be finite, but frame 3"):
         replace(motion, rotations=rotations)
+
+
+def test_errors_of_a_capture_are_bridged_when_it_is_asked(motion, tmp_path):
+    rotations = motion.rotations[:8].clone()
+    lowest = motion.skeleton.index("LowerBack")
+    rotations[3:5, lowest] = axis_angle_to_matrix(torch.tensor([2.2, 0.0, 0.0])) @ rotations[3:5, lowest]
+    broken = replace(motion, rotations=rotations, translation=motion.translation[:8])
+    broken.save(tmp_path / "broken.npz")
+    config = TryOnConfig("tshirt", tmp_path / "broken.npz", tmp_path / "out.npz", clear=False)
+    torch.testing.assert_close(run(config).motion.rotations, rotations, atol=1e-5, rtol=0)
+    found = run(replace(config, mend=True)).motion
+    torch.testing.assert_close(found.rotations, mended(broken).rotations, atol=1e-5, rtol=0)
+    assert float((found.rotations - motion.rotations[:8]).abs().max()) < 0.2
+    assert float((rotations - motion.rotations[:8]).abs().max()) > 1
 
 
 def test_a_checkpoint_of_another_garment_is_refused(tryon):

@@ -29,6 +29,7 @@ from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.formats import load_motion
 from workbench.garments import Garment
 from workbench.motion import Motion
+from workbench.motion_doubts import mended
 from workbench.store import atomic_write
 
 log = logging.getLogger(__name__)
@@ -284,7 +285,7 @@ class TryOnConfig:
 
     # The name of a garment whose networks ship, such as tshirt, or of one whose networks are in --networks.
     garment: tyro.conf.Positional[str]
-    # BVH, AMASS npz, or our own npz.
+    # BVH, AMASS npz, DeepMimic txt, or our own npz.
     motion: Path
     # The dressed sequence, npz.
     out: Path
@@ -292,6 +293,9 @@ class TryOnConfig:
     betas: str = ""
     # Rotate arms and legs clear of the body first: cloth cannot be where the body overlaps itself.
     clear: bool = True
+    # Bridge the frames of capture errors that fold a body in two (loading such a motion warns of them); by default they
+    # are dressed as they are.
+    mend: bool = False
     # A folder of networks (`workbench train`); those that ship when absent.
     networks: Path | None = None
 
@@ -302,6 +306,8 @@ def run(config: TryOnConfig) -> TryOnResult:
     body = tryon.model.body
     betas = shape_from_words(config.betas, body)
     motion = load_motion(config.motion, body)
+    if config.mend:
+        motion = mended(motion)
     if abs(motion.fps - tryon.regressor.fps) > 1e-3:
         motion = motion.resampled(tryon.regressor.fps)
     if config.clear:

@@ -11,6 +11,7 @@ from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
 from workbench.formats.amass import amass_motion, is_amass, read_arrays, smpl_t_pose
 from workbench.formats.bvh import read_bvh
+from workbench.formats.deepmimic import is_deepmimic, read_deepmimic
 from workbench.formats.motion_notes import notes_beside
 from workbench.motion import Motion, is_own_motion
 from workbench.motion_doubts import doubtful_spine
@@ -19,7 +20,7 @@ from workbench.retargeting import RetargetConfig, grounded, retarget
 __all__ = ["load_motion", "motion_files"]
 
 log = logging.getLogger(__name__)
-SUFFIXES = (".bvh", ".npz")
+SUFFIXES = (".bvh", ".npz", ".txt")
 
 
 def motion_files(folder: Path | None = None) -> list[Path]:
@@ -28,7 +29,8 @@ def motion_files(folder: Path | None = None) -> list[Path]:
     Raises ValueError where the folder has none.
     """
     folder = Path(str(resources.files("workbench") / "assets" / "motions")) if folder is None else folder
-    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = [path for path in files if path.suffix.lower() != ".txt" or is_deepmimic(path)]
     if not files:
         raise ValueError(f"no motion files ({', '.join(SUFFIXES)}) in {folder}")
     return files
@@ -42,7 +44,8 @@ def load_motion(
     mapping: Mapping[str, str] | None = None,
     config: RetargetConfig | None = None,
 ) -> Motion:
-    """Read a motion file (BVH, AMASS npz, our own npz), carry it over to the body, put it on the floor at z = 0.
+    """Read a motion file (BVH, AMASS npz, DeepMimic txt, our own npz), carry it over to the body, put it on the floor
+    at z = 0.
 
     Our own files for this very body come as they were saved.
 
@@ -57,6 +60,8 @@ def load_motion(
     fps, mapping = notes.fps if fps is None else fps, notes.joints if mapping is None else mapping
     if kind == ".bvh":
         motion = read_bvh(path, fps=fps)
+    elif kind == ".txt":
+        motion = read_deepmimic(path, fps=fps)
     elif kind == ".npz":
         arrays = read_arrays(path)
         if is_own_motion(arrays):
@@ -72,7 +77,8 @@ def load_motion(
             )
     else:
         raise ValueError(
-            f"{path}: motions are read from .bvh (any known rig) and .npz (AMASS, ours) files, not {kind!r}"
+            f"{path}: motions are read from .bvh (any known rig), .npz (AMASS, ours) and .txt (DeepMimic) files, "
+            f"not {kind!r}"
         )
     try:
         carried = grounded(retarget(motion, body.skeleton, mapping=mapping, config=config), body)
@@ -80,7 +86,7 @@ def load_motion(
         raise ValueError(f"{path}: {error}") from error
     doubt = doubtful_spine(carried)
     if doubt is not None:
-        log.warning("%s: %s", path, doubt)
+        log.warning("%s: %s (`workbench tryon --mend` bridges such frames)", path, doubt)
     return carried
 
 

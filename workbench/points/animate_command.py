@@ -40,7 +40,7 @@ class AnimateConfig:
 
     # The folder that `workbench fit` wrote, or the name of an outfit that the model was trained on.
     fit: tyro.conf.Positional[str]
-    # BVH, AMASS npz, or our own npz.
+    # BVH, AMASS npz, DeepMimic txt, or our own npz.
     motion: Path
     out: Path
     # The body's shape, with commas; that of the scan when absent.
