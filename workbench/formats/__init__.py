@@ -60,7 +60,7 @@ def load_motion(
     fps, mapping = notes.fps if fps is None else fps, notes.joints if mapping is None else mapping
     if kind == ".bvh":
         motion = read_bvh(path, fps=fps)
-    elif kind == ".txt":
+    elif kind == ".txt" and (not path.is_file() or is_deepmimic(path)):
         motion = read_deepmimic(path, fps=fps)
     elif kind == ".npz":
         arrays = read_arrays(path)
