@@ -31,8 +31,8 @@ AMPLITUDES = {
     "Leg": (45, 0, 0),
 }
 # Degrees of (flexion, abduction, twist) that a leg drawn up wanders between, and the flexion of its knee
-THIGH, KNEE = ((30, 130), (-15, 60), (-30, 45)), (20, 150)
-CURL = (0, 80)  # degrees that the joints of a curled spine bend forward together
+THIGH, KNEE = ((30, 120), (-15, 60), (-30, 45)), (20, 150)
+CURL = (0, 70)  # degrees that the joints of a curled spine bend forward together
 SPINE = ("LowerBack", "Spine", "Spine1")
 RATE = 0.6  # Hz: the fastest a joint wanders
 

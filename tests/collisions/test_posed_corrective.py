@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
@@ -24,6 +25,7 @@ from workbench.collisions.worn_poses import SHAPE_CUT, Jitter, WornPoses
 from workbench.geometry.patches import Patches
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
+from workbench.learning.network_file import read_network
 from workbench.motion import Motion
 
 NETWORK = NetworkConfig(width=32, depth=2, rank=30)
@@ -169,6 +171,25 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     with pytest.raises(ValueError, match="trained together"):
         TryOn.of(*networks, corrective=other)
     assert PosedCorrective.beside(tmp_path, "tshirt") is None
+
+
+def test_a_file_of_offsets_of_the_whole_garment_is_one_patch(tmp_path, body):
+    """As correctives were saved before they had patches, those that ship among them."""
+    chance = torch.Generator().manual_seed(3)
+    whole = Patches(torch.arange(40)[None], torch.ones(1, 40))
+    sizes, basis = (len(body.parents), body.shape_count), torch.randn(4, 120, generator=chance)
+    corrective = PosedCorrective("tshirt", *sizes, whole, basis, 16, chance)
+    torch.nn.init.normal_(corrective.layers[-1].weight, generator=chance)  # pyright: ignore[reportArgumentType]
+    corrective.save(tmp_path / "new.safetensors")
+    found = read_network(tmp_path / "new.safetensors", "")
+    tensors = {name: tensor for name, tensor in found.tensors.items() if not name.startswith("patches.")}
+    save_file(tensors, tmp_path / "old.safetensors", metadata={**found.metadata, "format": "corrective-1"})
+    old, new = (PosedCorrective.load(tmp_path / f"{name}.safetensors") for name in ("old", "new"))
+    pose = axis_angle_to_matrix(0.3 * torch.randn(3, len(body.parents), 3, generator=chance))
+    given = (torch.randn(3, body.shape_count, generator=chance), torch.randn(3, 25, generator=chance))
+    torch.testing.assert_close(old(pose, *given), new(pose, *given))
+    amounts = torch.randn(3, 4, generator=chance)
+    torch.testing.assert_close(old.mixed(amounts), (amounts @ new.basis).unflatten(-1, (-1, 3)))
 
 
 def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):

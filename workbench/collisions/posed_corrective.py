@@ -43,14 +43,14 @@ from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
 
-FORMAT = "corrective-2"
+FORMAT, WHOLE_FORMAT = "corrective-2", "corrective-1"  # the former: offsets of the whole garment, no patches
 MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
 # Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
 # a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
 MOVES = 0.05
 ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
-CLOSE_OVERLAP = 0.02  # share of the garment's vertices where the body may overlap itself in `close` poses
+CLOSE_ROOM = 0.004  # the same of `close` ones: cleared thighs come as near to a belly
 # Metres, root mean square over the garment, that an offset may have.  Looked at in pictures: test motions ask for up to
 # 52 mm (T-shirt) and 23 mm (dress), two clips of mocap with a pelvis that turns about in a few frames for 105 mm
 REACH = 0.06
@@ -84,7 +84,7 @@ class TrainCorrectiveConfig:
     motions: tuple[Path, ...] = ()
     # The same, but not cleared: those of their poses are learned from that leave cloth room.
     uncleared: tuple[Path, ...] = ()
-    # Uncleared ones of bodies that are folded up: there skin is on skin, and the body may overlap itself a little.
+    # Uncleared ones whose limbs may come as near to the trunk as those of cleared motions in a crouch.
     close: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
@@ -99,7 +99,7 @@ class TrainCorrectiveConfig:
     round_poses: int = 2000  # jittered poses whose contacts are looked at ...
     round_steps: int = 800  # ... and learned from for so many steps
     batch: int = 32  # poses a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=18_000, learning_rate=2e-3, clip_norm=50.0))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=24_000, learning_rate=2e-3, clip_norm=50.0))
     seed: int = 0
 
 
@@ -189,9 +189,11 @@ class PosedCorrective(nn.Module):
         """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
         found = read_network(Path(path), "train it with `workbench train corrective`")
         metadata = found.metadata
-        if metadata.get("format") != FORMAT:
+        if metadata.get("format") not in (FORMAT, WHOLE_FORMAT):
             raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
         basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
+        if metadata["format"] == WHOLE_FORMAT:
+            found.tensors.update(_one_patch(basis.shape[1] // 3))
         try:
             places, windows = (found.tensors.pop(f"patches.{name}") for name in ("vertices", "windows"))
             patches = Patches(places.long(), windows).checked(basis.shape[1] // 3)
@@ -210,6 +212,11 @@ class PosedCorrective(nn.Module):
         """The corrective of a garment in a folder of networks, if there is one."""
         path = folder / f"{garment_name}-corrective.safetensors"
         return PosedCorrective.load(path) if path.is_file() else None
+
+
+def _one_patch(vertices: int) -> dict[str, Tensor]:
+    """The whole garment as a patch, as files name its tensors."""
+    return {"patches.vertices": torch.arange(vertices)[None], "patches.windows": torch.ones(1, vertices)}
 
 
 def within_reach(offset: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B"]:
@@ -273,10 +280,10 @@ class CorrectiveTraining:
         wearer = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)
         worn = with_room(wearer(motions), self.garments, body)
         if split == "train":
-            for folders, room in ((config.uncleared, {"gap": ROOM}), (config.close, {"most": CLOSE_OVERLAP})):
+            for folders, room in ((config.uncleared, ROOM), (config.close, CLOSE_ROOM)):
                 if folders:
                     more = wearer.uncleared(_motions_in(folders, body))
-                    worn = WornPoses.joined([worn, with_room(more, self.garments, body, **room)])
+                    worn = WornPoses.joined([worn, with_room(more, self.garments, body, room)])
         log.info("%d poses of the %s motions", len(worn), split)
         return worn
 

@@ -118,14 +118,9 @@ class Wearer:
 
 @torch.no_grad()
 def with_room(
-    worn: WornPoses,
-    garments: Callable[[WornPoses], Float[Tensor, "B N 3"]],
-    body: Body,
-    gap: float = 0.0,
-    most: float = MOST_OVERLAP,
+    worn: WornPoses, garments: Callable[[WornPoses], Float[Tensor, "B N 3"]], body: Body, gap: float = 0.0
 ) -> WornPoses:
-    """The poses in which the body keeps `gap` metres from itself where the garment hangs, and does not overlap but at
-    `most` of the garment's vertices."""
+    """The poses in which the body keeps `gap` metres from itself where the garment hangs, and does not overlap."""
     free = []
     for part in torch.arange(len(worn)).split(64):
         some = worn[part]
@@ -133,7 +128,7 @@ def with_room(
         if gap:
             bodies = bodies + gap / 2 * vertex_normals(bodies, body.faces)
         overlap = penetration(bodies, body.faces, garments(some)[:, ::LOOKED_AT]).overlap.float().mean(dim=1)
-        free.append(some[torch.nonzero(overlap <= most)[:, 0]])
+        free.append(some[torch.nonzero(overlap <= MOST_OVERLAP)[:, 0]])
     return WornPoses.joined(free)
 
 
