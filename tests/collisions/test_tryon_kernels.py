@@ -13,7 +13,6 @@ from workbench.collisions.tryon_kernels import KernelCorrective, KernelNetworks,
 from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.extras import MissingExtra
 from workbench.formats import load_motion, motion_files
-from workbench.geometry.patches import Patches
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +84,7 @@ def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
 @pytest.mark.parametrize("size", [5, 500])  # 500: far beyond its reach
 def test_a_corrective_in_kernels_gives_what_torch_gives(tryon, size):
     chance = torch.Generator().manual_seed(2)
-    patches = Patches.of(tryon.garment.vertices, 12)
-    basis = size * torch.randn(16, 3 * patches.vertices.numel(), generator=chance)
-    corrective = PosedCorrective("tshirt", 31, 10, patches, basis, 64, chance)
+    corrective = PosedCorrective("tshirt", 31, 10, size * torch.randn(16, 3 * 4630, generator=chance), 64, chance)
     with torch.no_grad():
         for parameter in corrective.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=chance)

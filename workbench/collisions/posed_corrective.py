@@ -3,12 +3,9 @@
 Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
 touches nothing ends inside the posed body (facts.md 9).  25 latents cannot say where: pushing the regressor's own
 output (tried before) took a third of the collisions off and cost 2.4 mm of vertex error.  This network adds an offset
-C(theta, beta, x_bar) to D(x_bar), of low rank on each of many overlapping patches: what a crease needs is local.  In
-curled-up poses where a basis of 96 offsets of the whole T-shirt left 2.0 % inside with 60 mm of offset (root mean
-square), offsets without any basis, found pose by pose under the same terms, left 0.4 % with 16 mm.  It learns from
-`ContactPlanes` alone, on training motions worn by random shapes, cleared for them or with room; no ground truth.
-Eq. 16's hinge keeps X + C out of the canonical body, a penalty on C and on its Laplacian keeps it away from where it is
-not needed.
+C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `ContactPlanes` alone, on training motions worn by
+random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on
+C and on its Laplacian keeps it away from where it is not needed.
 """
 
 import json
@@ -34,7 +31,6 @@ from workbench.collisions.subspace import LATENTS, Subspace
 from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses, with_room
 from workbench.formats import load_motion, motion_files
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
-from workbench.geometry.patches import Patches
 from workbench.learning.batches import random_rows
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.network_file import read_network, write_network
@@ -43,14 +39,13 @@ from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
 
-FORMAT, WHOLE_FORMAT = "corrective-2", "corrective-1"  # the former: offsets of the whole garment, no patches
+FORMAT = "corrective-1"
 MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
 # Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
 # a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
 MOVES = 0.05
 ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
-CLOSE_ROOM = 0.004  # the same of `close` ones: cleared thighs come as near to a belly
 # Metres, root mean square over the garment, that an offset may have.  Looked at in pictures: test motions ask for up to
 # 52 mm (T-shirt) and 23 mm (dress), two clips of mocap with a pelvis that turns about in a few frames for 105 mm
 REACH = 0.06
@@ -84,12 +79,9 @@ class TrainCorrectiveConfig:
     motions: tuple[Path, ...] = ()
     # The same, but not cleared: those of their poses are learned from that leave cloth room.
     uncleared: tuple[Path, ...] = ()
-    # Uncleared ones whose limbs may come as near to the trunk as those of cleared motions in a crouch.
-    close: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
-    patches: int = 32  # of the garment, overlapping
-    rank: int = 24  # offsets that are mixed in each
+    rank: int = 96  # offsets that are mixed
     width: int = 512  # of the layers that say how much of each
     weights: CorrectiveWeights = CorrectiveWeights()  # of the terms of the loss
     jitter: Jitter = Jitter()  # what is added to poses, shapes and latents, at every look
@@ -104,22 +96,21 @@ class TrainCorrectiveConfig:
 
 
 class PosedCorrective(nn.Module):
-    """C(theta, beta, x_bar): two dense layers, ReLU and LayerNorm each, then amounts of a learned basis a patch."""
+    """C(theta, beta, x_bar): two dense layers, ReLU and LayerNorm each, then amounts of a learned basis."""
 
     def __init__(
         self,
         garment_name: str,
         joints: int,
         shapes: int,
-        patches: Patches,
-        basis: Float[Tensor, "R P3n"],
+        basis: Float[Tensor, "R N3"],
         width: int = 512,
         generator: torch.Generator | None = None,
     ):
-        """basis: of each patch, amounts -> flattened offsets, millimetres; beside each other."""
+        """basis: amounts -> flattened offsets, millimetres."""
         super().__init__()
         generator = generator or torch.Generator().manual_seed(0)
-        self.garment_name, self.joints, self.shapes, self.patches = garment_name, joints, shapes, patches
+        self.garment_name, self.joints, self.shapes = garment_name, joints, shapes
         inputs = 9 * (joints - 1) + shapes + LATENTS
         layers: list[nn.Module] = []
         for size in (inputs, width):
@@ -127,7 +118,7 @@ class PosedCorrective(nn.Module):
             nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
             nn.init.zeros_(dense.bias)
             layers += [dense, nn.ReLU(), nn.LayerNorm(width, eps=1e-3)]
-        last = nn.Linear(width, len(patches) * len(basis))
+        last = nn.Linear(width, len(basis))
         nn.init.zeros_(last.weight)  # it begins by correcting nothing
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
@@ -136,7 +127,7 @@ class PosedCorrective(nn.Module):
 
     @property
     def vertex_count(self) -> int:
-        return self.patches.point_count
+        return self.basis.shape[1] // 3
 
     def forward(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
@@ -151,15 +142,7 @@ class PosedCorrective(nn.Module):
         """The same before it is held to REACH: what training keeps small."""
         pose = (rotations[..., 1:, :, :] - torch.eye(3)).flatten(-3)
         seen = torch.cat([pose, FEATURE_SCALE * betas, FEATURE_SCALE * latent], dim=-1)
-        return self.mixed(self.layers(seen)) / MILLI
-
-    def mixed(self, amounts: Float[Tensor, "*B PR"]) -> Float[Tensor, "*B N 3"]:
-        """Offsets of amounts, millimetres."""
-        count = len(self.patches)
-        per_patch = amounts.reshape(-1, count, len(self.basis)).transpose(0, 1)  # (P,B,R)
-        values = per_patch @ self.basis.unflatten(1, (count, -1)).transpose(0, 1)  # (P,B,3n)
-        offsets = self.patches.spread(values.transpose(0, 1).unflatten(-1, (-1, 3)))
-        return offsets.reshape(*amounts.shape[:-1], *offsets.shape[-2:])
+        return (self.layers(seen) @ self.basis).unflatten(-1, (-1, 3)) / MILLI
 
     def ignore(self, joints: Sequence[int]) -> None:
         """Make the offset independent of these joints' rotations, also while it learns."""
@@ -173,7 +156,7 @@ class PosedCorrective(nn.Module):
         first.weight.register_hook(lambda gradient: gradient * kept)
 
     def save(self, path: Path) -> None:
-        """The parameters, with what made them; basis and amounts as int8, a hundredth or two of an offset."""
+        """The parameters, with what made them; the basis as int8, a hundredth or two of an offset."""
         metadata = {
             "format": FORMAT,
             "garment": self.garment_name,
@@ -181,28 +164,18 @@ class PosedCorrective(nn.Module):
             "shapes": str(self.shapes),
             "story": json.dumps(self.story),
         }
-        patches = {"patches.vertices": self.patches.vertices.int(), "patches.windows": self.patches.windows.half()}
-        write_network(self, path, metadata, coarse={"basis": 0, "layers.6.weight": 0}, beside=patches)
+        write_network(self, path, metadata, coarse={"basis": 0})
 
     @staticmethod
     def load(path: str | Path) -> "PosedCorrective":
         """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
         found = read_network(Path(path), "train it with `workbench train corrective`")
         metadata = found.metadata
-        if metadata.get("format") not in (FORMAT, WHOLE_FORMAT):
+        if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
         basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
-        if metadata["format"] == WHOLE_FORMAT:
-            found.tensors.update(_one_patch(basis.shape[1] // 3))
-        try:
-            places, windows = (found.tensors.pop(f"patches.{name}") for name in ("vertices", "windows"))
-            patches = Patches(places.long(), windows).checked(basis.shape[1] // 3)
-        except (KeyError, ValueError) as error:
-            raise ValueError(
-                f"network {path} is damaged ({error}); train it with `workbench train corrective`"
-            ) from error
         sizes = (int(metadata["joints"]), int(metadata["shapes"]))
-        corrective = PosedCorrective(metadata["garment"], *sizes, patches, torch.zeros_like(basis), width)
+        corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), width)
         corrective.load_state_dict(found.tensors)
         corrective.story = json.loads(metadata["story"])
         return corrective.eval()
@@ -212,11 +185,6 @@ class PosedCorrective(nn.Module):
         """The corrective of a garment in a folder of networks, if there is one."""
         path = folder / f"{garment_name}-corrective.safetensors"
         return PosedCorrective.load(path) if path.is_file() else None
-
-
-def _one_patch(vertices: int) -> dict[str, Tensor]:
-    """The whole garment as a patch, as files name its tensors."""
-    return {"patches.vertices": torch.arange(vertices)[None], "patches.windows": torch.ones(1, vertices)}
 
 
 def within_reach(offset: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B"]:
@@ -268,7 +236,7 @@ class CorrectiveTraining:
         return [joint for joint in range(1, len(moves)) if not (moves[joint] or moves[body.parents[joint]])]
 
     def wear(self, split: str) -> WornPoses:
-        """The motions of a split on random shapes; training also takes those of `motions`, `uncleared` and `close`."""
+        """The motions of a split on random shapes; training also takes those of `motions` and `uncleared`."""
         config, body, fps = self.config, self.model.body, self.data.fps
         motions = [
             Motion(s.rotations, s.translation, fps, body.skeleton, s.motion_name) for s in self.data.of_split(split)
@@ -279,12 +247,9 @@ class CorrectiveTraining:
         kept = config.out / "work" / "cleared"
         wearer = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)
         worn = with_room(wearer(motions), self.garments, body)
-        if split == "train":
-            for folders, room in ((config.uncleared, ROOM), (config.close, CLOSE_ROOM)):
-                if folders:
-                    more = wearer.uncleared(_motions_in(folders, body))
-                    worn = WornPoses.joined([worn, with_room(more, self.garments, body, room)])
-        log.info("%d poses of the %s motions", len(worn), split)
+        if split == "train" and config.uncleared:
+            loose = wearer.uncleared(_motions_in(config.uncleared, body))
+            worn = WornPoses.joined([worn, with_room(loose, self.garments, body, ROOM)])
         return worn
 
     def garments(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
@@ -307,26 +272,23 @@ class CorrectiveTraining:
         short = (self.config.weights.posed_clearance - distance.detach()).clamp_min(0.0)
         return (local.rotation.mT @ (short[..., None] * away)[..., None])[..., 0]
 
-    def first_basis(self, worn: WornPoses, patches: Patches) -> Float[Tensor, "R P3n"]:
-        """Principal directions, on each patch, of the needed corrections of some frames; millimetres."""
+    def first_basis(self, worn: WornPoses) -> Float[Tensor, "R N3"]:
+        """Principal directions of the needed corrections of some frames, millimetres."""
         generator = torch.Generator().manual_seed(self.config.seed + 1)
         some = torch.randperm(len(worn), generator=generator)[: self.config.first_frames]
-        needed = torch.cat([self.needed(worn[part]) for part in some.split(16)])
-        of_patches = needed[:, patches.vertices].transpose(0, 1).flatten(2)  # (P,F,3n)
-        _, size, directions = torch.linalg.svd(of_patches, full_matrices=False)
-        rank = min(self.config.rank, size.shape[1])
-        scaled = directions[:, :rank] * (size[:, :rank, None] / len(needed) ** 0.5 + 1e-6)
-        return MILLI * FIRST_GAIN * scaled.transpose(0, 1).flatten(1)
+        needed = torch.cat([self.needed(worn[part]).flatten(1) for part in some.split(16)])
+        _, size, directions = torch.linalg.svd(needed, full_matrices=False)
+        rank = min(self.config.rank, len(size))
+        return MILLI * FIRST_GAIN * directions[:rank] * (size[:rank, None] / len(needed) ** 0.5 + 1e-6)
 
     def begin(self, worn: WornPoses) -> PosedCorrective:
         """What training begins with: a corrective that corrects nothing, or `start`."""
         if self.start is not None:
             return self.start
         config, body = self.config, self.model.body
-        patches = Patches.of(self.data.mean.reshape(-1, 3), config.patches)
-        basis = self.first_basis(worn, patches)
+        basis = self.first_basis(worn)
         sizes = (self.data.garment_name, len(body.parents), body.shape_count)
-        return PosedCorrective(*sizes, patches, basis, config.width, torch.Generator().manual_seed(config.seed))
+        return PosedCorrective(*sizes, basis, config.width, torch.Generator().manual_seed(config.seed))
 
     def loss(self, corrective: PosedCorrective, contacts: ContactPlanes) -> Float[Tensor, ""]:
         """The terms of `CorrectiveWeights`, of one batch."""

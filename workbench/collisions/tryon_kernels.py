@@ -134,14 +134,8 @@ class KernelCorrective:
         assert isinstance(first, nn.Linear)
         self.inputs = np.zeros(first.in_features, np.float32)
         self.trunk = Trunk("the corrective's", corrective.layers, self.inputs)
-        count, rank = len(corrective.patches), len(corrective.basis)
-        amounts = self.trunk.outputs.reshape(count, rank)
-        self.patches: list[Dense] = []
-        for patch, basis in enumerate(corrective.basis.T.unflatten(0, (count, -1))):
-            name = f"the corrective's basis of patch {patch}"
-            self.patches.append(Dense(name, basis, basis.new_zeros(len(basis)), amounts[patch]))
-        self.values = np.zeros((count, corrective.basis.shape[1] // count), np.float32)
-        self.matrix = corrective.patches.matrix
+        basis = corrective.basis.T
+        self.spread = Dense("the corrective's basis", basis, basis.new_zeros(len(basis)), self.trunk.outputs)
 
     def __call__(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
@@ -150,13 +144,11 @@ class KernelCorrective:
             return self.corrective(rotations, betas, latent)
         pose = (rotations.numpy()[1:] - np.eye(3, dtype=np.float32)).reshape(-1)
         np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
-        for call in (*self.trunk.calls, *(patch.call for patch in self.patches)):
+        for call in (*self.trunk.calls, self.spread.call):
             call()
-        for values, patch in zip(self.values, self.patches, strict=True):
-            values[:] = patch.outputs
-        offset = self.matrix @ self.values.reshape(-1, 3)
-        size = math.sqrt(float(np.vdot(offset, offset)) / len(offset)) / MILLI  # metres: `within_reach` of one frame
-        return torch.from_numpy(offset * np.float32(REACH / max(size, REACH) / MILLI))
+        flat = self.spread.outputs
+        size = math.sqrt(3 * float(flat @ flat) / len(flat)) / MILLI  # metres: `within_reach` of one frame
+        return torch.from_numpy(flat * np.float32(REACH / max(size, REACH) / MILLI)).reshape(-1, 3)
 
 
 def quickest(tryon: TryOn) -> TryOn:
