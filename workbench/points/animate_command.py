@@ -42,6 +42,7 @@ class AnimateConfig:
     fit: tyro.conf.Positional[str]
     # BVH, AMASS npz, DeepMimic txt, or our own npz.
     motion: Path
+    # The folder that is written: points and normals of every frame, and what else is asked for.
     out: Path
     # The body's shape, with commas; that of the scan when absent.
     betas: str | None = None
@@ -59,7 +60,9 @@ class AnimateConfig:
     mesh: bool = False
     # A trained model; the one that ships when absent.
     model: Path | None = None
+    # How points become meshes.
     meshing: MeshingConfig = MeshingConfig()
+    # Of the places of the skin that are asked, where `points` says how many.
     seed: int = 0
 
 
