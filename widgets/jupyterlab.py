@@ -22,6 +22,8 @@ CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 # WebGL by the processor: a bare machine has no graphics card
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
 PATIENCE = 180.0  # seconds, for a machine that other jobs keep busy
+UNHEARD = 10.0  # seconds in which a cell that took the keys shows at least that it waits
+NEVER_RUN = "[ ]:"  # the prompt of a cell
 
 # Every drawing of a view whose pixels differ from the one before leaves its time; reading them back waits for them.
 WATCH = """(root) => {
@@ -150,14 +152,29 @@ class Notebook:
         Errors: RuntimeError with the cell's own error.
         """
         cell = self.page.locator(".jp-CodeCell").nth(index)
-        cell.locator(".jp-InputArea-editor").click()
-        self.page.keyboard.press("Control+Enter")
+        self._press(cell)
         shown = cell.locator(shows)
         fault = cell.locator('[data-mime-type="application/vnd.jupyter.error"], [data-mime-type*="stderr"]')
         shown.or_(fault).first.wait_for(state="attached", timeout=1e3 * PATIENCE)
         if fault.count():
             raise RuntimeError(f"cell {index} ended in: {fault.first.inner_text()[-800:]}")
         return shown.first
+
+    def _press(self, cell: Any) -> None:
+        """Ctrl+Enter in a cell; again if it never ran and shows no sign: a dialog may have taken the keys."""
+        from playwright.sync_api import expect
+
+        prompt = cell.locator(".jp-InputPrompt").first
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            cell.locator(".jp-InputArea-editor").click()
+            first_run = prompt.inner_text().strip() == NEVER_RUN
+            self.page.keyboard.press("Control+Enter")
+            if not first_run:
+                return  # its old number may be its new one, after a restart: nothing to tell them by
+            with contextlib.suppress(AssertionError):
+                expect(prompt).not_to_have_text(NEVER_RUN, timeout=1e3 * UNHEARD)
+                return
 
 
 def open_notebook(page: Any, lab: JupyterLab, name: str, cells: list[str]) -> Notebook:

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
+import widgets.jupyterlab
 from widgets.jupyterlab import Watched, grab, jupyterlab, open_notebook, page_megabytes
 
 pytestmark = pytest.mark.browser
@@ -268,3 +269,22 @@ def test_a_dead_kernel_is_told_in_the_views(notebook, lab):
     live.locator(".wbv-play").click()  # frames are in the browser
     expect(live).not_to_have_attribute("data-frame", before)
     notebook.troubles.clear()  # JupyterLab tells of its kernel's end on the console
+
+
+def test_a_cell_whose_keys_were_lost_is_run_again(shown_browser, tmp_path, monkeypatch):
+    page, pressed = shown_browser.new_page(), []
+    with jupyterlab(tmp_path) as lab:
+        opened = open_notebook(page, lab, "deaf", ["print('heard')"])
+        keyboard = type(page.keyboard)
+        real = keyboard.press
+
+        def press(self, key):
+            pressed.append(key)
+            if len(pressed) > 1:
+                real(self, key)
+
+        monkeypatch.setattr(keyboard, "press", press)
+        monkeypatch.setattr(widgets.jupyterlab, "UNHEARD", 3.0)
+        opened.run(0, 'text="heard"')
+        assert len(pressed) >= 2
+        page.close()

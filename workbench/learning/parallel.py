@@ -4,6 +4,7 @@ Each process draws its own batches; gradients are averaged, so a step of N proce
 batch.  Files are written by the first process alone, into folders that all of them see.
 """
 
+import atexit
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,4 +77,14 @@ def processes() -> Processes:
     if not group.is_initialized():
         with_gpus = torch.cuda.is_available() and group.is_nccl_available()
         group.init_process_group("cpu:gloo,cuda:nccl" if with_gpus else "gloo")
+        atexit.register(_leave)
     return Processes(group.get_rank(), group.get_world_size())
+
+
+def _leave() -> None:
+    """Leave the group while Python still runs: gloo's threads may hold tensors, and letting those go later aborts.
+
+    A run that had done all its work ended with SIGABRT, once in some hundred (pytorch/pytorch#179291).
+    """
+    if group.is_initialized():
+        group.destroy_process_group()
