@@ -17,10 +17,14 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="torchrun's stor
 
 # argv: checkpoint, step to stop at (-1: never), where to write the parameters, whether batches are drawn by chance
 SCRIPT = """
+import atexit
 import sys
 from pathlib import Path
 
 import torch
+from torch import distributed
+
+atexit.register(lambda: print("together" if distributed.is_initialized() else "left"))  # runs last
 
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.parallel import processes
@@ -60,6 +64,7 @@ def both(folder: Path, checkpoint: str, *, stop_at: int = -1, chance: bool = Tru
     script.write_text(SCRIPT)
     done = torchrun(folder, str(script), checkpoint, str(stop_at), str(folder), "chance" if chance else "fixed")
     assert (done.returncode == 0) == (stop_at < 0), done.stderr[-2000:]
+    assert done.stdout.split() == ["left", "left"]  # else gloo's threads may abort Python while it ends
     return [] if stop_at >= 0 else [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in (0, 1)]
 
 
