@@ -4,9 +4,10 @@ A choreography shares a bend among the joints of the spine, lets the clavicle fo
 People, and the skeletons that motion capture is put on, share otherwise: here every joint that moves a garment wanders
 by itself about what the motion asks of it; in half of the motions the joints of the spine wander as one, and the lowest
 has the bend of all, as on skeletons that have no other.  Loosened motions of the families hardly bend a hip by 110
-degrees, and those that do push the thigh into the belly; lifted ones do little else, and are for clearing.
+degrees, and those that do push the thigh into the belly; lifted and curled ones do little else.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +30,9 @@ AMPLITUDES = {
     "UpLeg": (70, 20, 25),
     "Leg": (45, 0, 0),
 }
-LIFTED = {"UpLeg": (70, 145), "Leg": (50, 150)}  # degrees of flexion that a lifted leg wanders between
+# Degrees of (flexion, abduction, twist) that a leg drawn up wanders between, and the flexion of its knee
+THIGH, KNEE = ((30, 130), (-15, 60), (-30, 45)), (20, 150)
+CURL = (0, 80)  # degrees that the joints of a curled spine bend forward together
 SPINE = ("LowerBack", "Spine", "Spine1")
 RATE = 0.6  # Hz: the fastest a joint wanders
 
@@ -61,19 +64,36 @@ def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
 
 
 def lifted(motion: Motion, rng: np.random.Generator) -> Motion:
-    """The loosened motion with one knee, or both, drawn up: deep kicks and crouches.
-
-    Thighs are in the belly where trunk and hip bend together, until the motion is cleared.
-    """
-    frames, times = joint_frames(motion.skeleton), np.arange(len(motion)) / motion.fps
+    """The loosened motion with one knee, or both, drawn up: kicks and crouches."""
     loose = loosened(motion, rng)
+    sides = (("Left",), ("Right",), ("Left", "Right"))[rng.integers(3)]
+    return replace(_drawn_up(loose, sides, rng), name=f"{motion.name}_lifted")
+
+
+def curled(motion: Motion, rng: np.random.Generator) -> Motion:
+    """The loosened motion with both knees drawn up to a bent trunk: who rolls, gets up from the floor, ties a shoe."""
+    frames, times = joint_frames(motion.skeleton), np.arange(len(motion)) / motion.fps
+    loose = _drawn_up(loosened(motion, rng), ("Left", "Right"), rng)
     rotations, angles = loose.rotations.clone(), joint_angles(loose)
-    for side in (("Left",), ("Right",), ("Left", "Right"))[rng.integers(3)]:
-        for joint, (low, high) in LIFTED.items():
-            meant = angles[side + joint].clone()
-            meant[:, 0] = torch.from_numpy(wander(rng, times, low, high, RATE))
-            rotations[:, motion.skeleton.index(side + joint)] = frames[side + joint].rotation(meant).float()
-    return replace(loose, rotations=rotations, name=f"{motion.name}_lifted")
+    bend = torch.from_numpy(wander(rng, times, *CURL, RATE)) / len(SPINE)
+    for joint in SPINE:
+        meant = torch.stack([bend, *angles[joint].unbind(1)[1:]], dim=1)
+        rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
+    whole = replace(loose, rotations=rotations, name=f"{motion.name}_curled")
+    return gathered(whole) if rng.random() < 0.5 else whole
+
+
+def _drawn_up(motion: Motion, sides: Sequence[str], rng: np.random.Generator) -> Motion:
+    """The motion with the legs of these sides wandering in the ranges of THIGH and KNEE."""
+    frames, times = joint_frames(motion.skeleton), np.arange(len(motion)) / motion.fps
+    rotations, angles = motion.rotations.clone(), joint_angles(motion)
+    for side in sides:
+        thigh = np.stack([wander(rng, times, *ends, RATE) for ends in THIGH], axis=-1)
+        shank = angles[side + "Leg"].clone()
+        shank[:, 0] = torch.from_numpy(wander(rng, times, *KNEE, RATE))
+        for joint, meant in ((side + "UpLeg", torch.from_numpy(thigh)), (side + "Leg", shank)):
+            rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
+    return replace(motion, rotations=rotations)
 
 
 def gathered(motion: Motion) -> Motion:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from assets_gen.dataset import LIVELY
-from assets_gen.loose_motions import lifted, loosened
+from assets_gen.loose_motions import curled, lifted, loosened
 from assets_gen.motions import FAMILIES, generate
 from workbench.body.model import Body
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet, Projected, compact
@@ -33,19 +33,21 @@ CODE = (
     "workbench.collisions.regressor",
     "workbench.collisions.motion_descriptor",
     "workbench.collisions.posed_corrective",
+    "workbench.collisions.limb_sight",
     "workbench.collisions.posed_distance",
     "workbench.collisions.contact_planes",
     "workbench.collisions.worn_poses",
+    "workbench.geometry.patches",
     "workbench.learning.fit",
 )
-LOOSE_FROM, LIFTED_FROM, LOOSE_FRAMES = 100, 300, 60
+LOOSE_FROM, DRAWN_UP_FROM, LOOSE_FRAMES = 100, 300, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
 # T-shirt: more clearance than the default, since gap and vertex error had room for it; changed together with what it
 # learns from, not by itself.  Dress: what hangs far off the body is moved for nothing, which costs vertex error.
 CORRECTIVE_WEIGHTS = {
-    "tshirt": CorrectiveWeights(posed_clearance=6e-3),
-    "dress": CorrectiveWeights(size=0.02),
+    "tshirt": CorrectiveWeights(size=0.002, posed_clearance=6e-3),
+    "dress": CorrectiveWeights(size=0.025),
 }
 # Tab. 1: what each row leaves out of Eq. 13
 ABLATIONS = {
@@ -76,8 +78,8 @@ class ModelsConfig:
     """the same of the family that covers pose space most widely"""
     loose: int = 80
     """loosened motions of each training family, not cleared, that only the corrective sees"""
-    lifted: int = 8
-    """the same with knees drawn up, cleared"""
+    drawn_up: int = 60
+    """the same with one knee or both drawn up, and as many with both drawn up to a bent trunk"""
     stages: tuple[str, ...] = STAGES
     """what to train; of the others the networks in `out` are taken"""
 
@@ -98,13 +100,14 @@ def run(config: ModelsConfig) -> None:
     if "regressor" in config.stages:
         stories["regressor"] = train_regressor(replace(config.regressor, **here)).story
     if "corrective" in config.stages:
-        further = (further_motions(config),) if config.further or config.further_lively else ()
-        motions = (*further, *([lifted_motions(config)] if config.lifted else []))
+        motions = (further_motions(config),) if config.further or config.further_lively else ()
         uncleared = (loose_motions(config),) if config.loose else ()
+        close = drawn_up_motions(config) if config.drawn_up else ()
         weights = config.corrective.weights
         if weights == CorrectiveWeights():
             weights = CORRECTIVE_WEIGHTS.get(config.garment, weights)
-        learned = replace(config.corrective, motions=motions, uncleared=uncleared, weights=weights, **here)
+        seen = {"motions": motions, "uncleared": uncleared, "close": close}
+        learned = replace(config.corrective, weights=weights, **seen, **here)
         stories["corrective"] = train_corrective(learned).story
     if config.data is not None:
         return
@@ -143,9 +146,10 @@ def loose_motions(config: ModelsConfig) -> Path:
     return _wandering(config.work / "work" / "loose", loosened, range(LOOSE_FROM, LOOSE_FROM + config.loose))
 
 
-def lifted_motions(config: ModelsConfig) -> Path:
-    """The same with knees drawn up."""
-    return _wandering(config.work / "work" / "lifted", lifted, range(LIFTED_FROM, LIFTED_FROM + config.lifted))
+def drawn_up_motions(config: ModelsConfig) -> tuple[Path, ...]:
+    """The same with knees drawn up, and with knees drawn up to a bent trunk."""
+    work, indices = config.work / "work", range(DRAWN_UP_FROM, DRAWN_UP_FROM + config.drawn_up)
+    return (_wandering(work / "lifted", lifted, indices), _wandering(work / "curled", curled, indices))
 
 
 def _wandering(folder: Path, changed: Callable[[Motion, np.random.Generator], Motion], indices: Sequence[int]) -> Path:

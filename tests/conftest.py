@@ -12,6 +12,7 @@ os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 from jaxtyping import install_import_hook
 
 # Warp's kernels are no Python functions: imported unchecked
+import workbench.collisions.limb_kernels
 import workbench.collisions.network_kernels
 import workbench.collisions.posing_kernels
 import workbench.geometry.warp_kernels  # noqa: F401  imported for the hook below

@@ -8,6 +8,7 @@ import torch
 import tyro
 
 from workbench.body.model import Body
+from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.sequences import SimulatedSequence
 from workbench.collisions.tryon import load_tryon
 from workbench.collisions.tryon_onnx import write_onnx
@@ -55,7 +56,8 @@ def run(config: ExportConfig) -> list[Path]:
     """
     if config.onnx:
         tryon = load_tryon(str(config.sequence), config.networks)
-        return write_onnx(config.out, tryon.regressor, tryon.subspace)
+        corrective = tryon.corrective if isinstance(tryon.corrective, PosedCorrective) else None
+        return write_onnx(config.out, tryon.regressor, tryon.subspace, corrective)
     still = still_mesh(config.sequence)
     if still is not None:
         write_mesh(config.out, still)

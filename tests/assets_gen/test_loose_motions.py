@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from assets_gen.loose_motions import AMPLITUDES, LIFTED, SPINE, gathered, lifted, loosened
+from assets_gen.loose_motions import AMPLITUDES, CURL, KNEE, SPINE, THIGH, curled, gathered, lifted, loosened
 from assets_gen.motions import beyond_limits, generate, joint_angles, limit_of
 from workbench.motion import Motion
 
@@ -58,20 +58,38 @@ def fastest(motion: Motion) -> float:
     return float(torch.arccos(((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).max())
 
 
+def drawn_up(motion: Motion, side: str) -> bool:
+    """All frames have this side's thigh and shank in the ranges of a leg drawn up."""
+    angles = joint_angles(motion)
+    of_axes = zip((*THIGH, KNEE), (*angles[side + "UpLeg"].T, angles[side + "Leg"][:, 0]), strict=True)
+    return all(low - 0.1 <= float(x.min()) and float(x.max()) <= high + 0.1 for (low, high), x in of_axes)
+
+
 def test_lifted_knees_are_drawn_up_and_all_else_is_as_loosened(body):
     motion = generate("walk_02", body.skeleton, frames=20)
     for seed in range(6):
         high = lifted(motion, np.random.default_rng(seed))
-        angles = joint_angles(high)
-        raised = [
-            side
-            for side in ("Left", "Right")
-            if all(float(angles[side + joint][:, 0].min()) >= low - 0.1 for joint, (low, _) in LIFTED.items())
-        ]
+        raised = [side for side in ("Left", "Right") if drawn_up(high, side)]
         assert raised
         loose = loosened(motion, np.random.default_rng(seed))
         changed = (high.rotations != loose.rotations).flatten(2).any(2).any(0)
         assert {motion.skeleton.names[k] for k in torch.nonzero(changed)[:, 0].tolist()} == {
-            side + joint for side in raised for joint in LIFTED
+            side + joint for side in raised for joint in ("UpLeg", "Leg")
         }
     assert high.name == "walk_02_lifted"
+
+
+def test_who_is_curled_bends_both_hips_and_a_spine_that_is_whole_or_gathered(body):
+    motion = generate("walk_02", body.skeleton, frames=20)
+    others = [motion.skeleton.index(joint) for joint in SPINE[1:]]
+    kinds = set()
+    for seed in range(8):
+        found = curled(motion, np.random.default_rng(seed))
+        assert all(drawn_up(found, side) for side in ("Left", "Right"))
+        gathered_one = all(torch.equal(found.rotations[:, k], torch.eye(3).expand(20, 3, 3)) for k in others)
+        kinds.add(gathered_one)
+        if not gathered_one:
+            bend = sum(joint_angles(found)[joint][:, 0] for joint in SPINE)
+            assert CURL[0] - 0.1 <= float(bend.min()) and float(bend.max()) <= CURL[1] + 0.1  # pyright: ignore
+    assert kinds == {True, False}
+    assert found.name == "walk_02_curled"

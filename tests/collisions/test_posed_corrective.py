@@ -6,7 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
+from workbench.collisions.diffused_body import GridFields
+from workbench.collisions.limb_sight import LimbSight
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
     REACH,
@@ -21,6 +25,7 @@ from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TryOn, load_tryon
 from workbench.collisions.worn_poses import SHAPE_CUT, Jitter, WornPoses
+from workbench.geometry.patches import Patches
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
 from workbench.motion import Motion
@@ -39,6 +44,7 @@ def config(small_set, body, tmp_path_factory) -> TrainCorrectiveConfig:
     return TrainCorrectiveConfig(
         data=folder / "set.npz",
         out=folder,
+        patches=6,
         rank=8,
         width=32,
         shapes_a_motion=1,
@@ -59,19 +65,28 @@ def closed_arms(body, count: int) -> WornPoses:
     return WornPoses(rotations, torch.zeros(count, body.shape_count), torch.zeros(count, 25))
 
 
+def drawn(body, vertices: int = 50, patches: Patches | None = None, *, name: str = "tshirt", seed: int = 0):
+    """A corrective of some points about the trunk, by chance but for its last layer."""
+    chance = torch.Generator().manual_seed(seed)
+    points = torch.tensor([0.0, 0.0, 1.2]) + 0.2 * torch.randn(vertices, 3, generator=chance)
+    patches = patches or Patches.of(points, 4)
+    sight = LimbSight.of(body, GridFields.default(), points[: len(patches)])
+    basis = torch.randn(6, 3 * patches.vertices.numel(), generator=chance)
+    return PosedCorrective(name, patches, sight, basis, width=16, generator=chance)
+
+
 def test_it_begins_by_correcting_nothing_and_does_not_see_the_root(body):
-    basis = torch.randn(6, 3 * 50)
-    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=16)
+    corrective = drawn(body)
     pose = axis_angle_to_matrix(0.3 * torch.randn(4, len(body.parents), 3))
     given = (torch.randn(4, body.shape_count), torch.randn(4, 25))
     assert not corrective(pose, *given).any()
-    torch.nn.init.normal_(corrective.layers[-1].weight)  # pyright: ignore[reportArgumentType]
+    torch.nn.init.normal_(corrective.last)
     turned = pose.clone()
     turned[:, 0] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, 1.0]))
     torch.testing.assert_close(corrective(turned, *given), corrective(pose, *given))
     bent = pose.clone()
-    bent[:, 5] = turned[:, 0]
-    assert float((corrective(bent, *given) - corrective(pose, *given)).abs().max()) > 0
+    bent[:, body.joint_names.index("LeftArm")] = turned[:, 0]
+    assert not torch.equal(corrective(bent, *given), corrective(pose, *given))
 
 
 def test_an_offset_beyond_its_reach_keeps_its_direction_and_loses_the_rest():
@@ -103,8 +118,7 @@ def test_what_is_needed_brings_vertices_out(config, body):
 
 def test_learning_frees_vertices(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    basis = training.first_basis(worn)
-    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, basis, width=32)
+    corrective = training.begin(worn)
     optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
     first = float(training.loss(corrective, training.contacts(corrective, worn)).detach())
     for _ in range(2):
@@ -149,7 +163,28 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
         PosedCorrective.load(tmp_path / "bad.safetensors")
     with pytest.raises(ValueError, match="is no corrective"):
         PosedCorrective.load(config.out / "tshirt-regressor.safetensors")
-    other = PosedCorrective("dress", len(body.parents), body.shape_count, torch.zeros(2, 30))
+    other = drawn(body, name="dress")
+    patches = other.patches
+    for broken in (
+        Patches(patches.vertices + 1, patches.windows),
+        Patches(patches.vertices, patches.windows * float("nan")),
+        Patches(patches.vertices[:1], patches.windows[:1]),
+    ):
+        other.patches = broken
+        other.save(tmp_path / "odd.safetensors")
+        with pytest.raises(ValueError, match=r"odd.safetensors is damaged \(patches .* `workbench train corrective`"):
+            PosedCorrective.load(tmp_path / "odd.safetensors")
+    other.patches = patches
+    other.save(tmp_path / "whole.safetensors")
+    with safe_open(tmp_path / "whole.safetensors", framework="pt") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    del tensors["last"]
+    save_file(tensors, tmp_path / "part.safetensors", metadata=metadata)
+    with pytest.raises(ValueError, match=r"part.safetensors is damaged .*last"):
+        PosedCorrective.load(tmp_path / "part.safetensors")
+    save_file(tensors, tmp_path / "old.safetensors", metadata={**metadata, "format": "corrective-1"})
+    with pytest.raises(ValueError, match="expected 'corrective-2'.*workbench train corrective"):
+        PosedCorrective.load(tmp_path / "old.safetensors")
     networks = (
         Subspace.load(config.out / "tshirt-subspace.safetensors"),
         Regressor.load(config.out / "tshirt-regressor.safetensors"),
@@ -157,27 +192,6 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     with pytest.raises(ValueError, match="trained together"):
         TryOn.of(*networks, corrective=other)
     assert PosedCorrective.beside(tmp_path, "tshirt") is None
-
-
-def test_joints_that_are_ignored_stay_so_while_it_learns(config, body):
-    training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
-    corrective = PosedCorrective("tshirt", len(body.parents), body.shape_count, training.first_basis(worn), width=32)
-    ignored = training.unseen_joints()
-    names = {body.joint_names[joint] for joint in ignored}
-    assert {"LeftToeBase", "RightFingerBase"} <= names
-    assert not names & {"LeftArm", "RightForeArm", "LeftUpLeg", "LeftLeg", "Spine1", "Head"}
-    corrective.ignore(ignored)
-    optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
-    contacts = training.contacts(corrective, worn)
-    for _ in range(3):
-        optimizer.zero_grad()
-        training.loss(corrective, contacts).backward()
-        optimizer.step()
-    bent = worn.rotations.clone()
-    bent[:, ignored] = axis_angle_to_matrix(torch.tensor([0.3, 0.2, -0.4]))
-    moved = corrective(worn.rotations, worn.betas, worn.latents)
-    assert moved.any()
-    torch.testing.assert_close(corrective(bent, worn.betas, worn.latents), moved)
 
 
 def test_further_motions_are_worn_in_training_alone(config, body, tmp_path):
@@ -204,7 +218,7 @@ def test_jitter_leaves_the_root_and_without_it_everything(body):
     assert float(other.betas.abs().max()) == SHAPE_CUT
 
 
-def test_it_begins_with_another_where_one_is_given(config, tmp_path):
+def test_it_begins_with_another_where_one_is_given(config, body, tmp_path):
     first = run(config)
     for name in ("tshirt-subspace.safetensors", "tshirt-regressor.safetensors"):
         shutil.copy(config.out / name, tmp_path)
@@ -215,28 +229,29 @@ def test_it_begins_with_another_where_one_is_given(config, tmp_path):
         torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-5, rtol=1e-5)
     assert again.story["start"]["curves"] == first.story["curves"]
     assert len(again.basis) == len(first.basis)
-    PosedCorrective("dress", first.joints, first.shapes, first.basis.detach(), width=32).save(tmp_path / "dress")
+    drawn(body, name="dress").save(tmp_path / "dress")
     with pytest.raises(ValueError, match="is a corrective of 'dress'"):
         run(replace(config, start=tmp_path / "dress"))
 
 
 def test_uncleared_motions_are_worn_where_they_leave_room(config, body, tmp_path):
-    joint = body.joint_names.index("LeftArm")
     rotations = body.rest_rotations()[None].repeat(12, 1, 1, 1)
-    rotations[6:, joint] = axis_angle_to_matrix(torch.tensor([0.0, 1.4, 0.0]))  # deep in the flank
+    for joint, turn in (("LowerBack", (2.6, 0, 0)), ("LeftArm", (0, 1.4, 0)), ("RightArm", (0, -1.4, 0))):
+        # the chest in the thighs, the arms deep in the flanks
+        rotations[6:, body.joint_names.index(joint)] = axis_angle_to_matrix(torch.tensor(turn).float())
     Motion(rotations, torch.zeros(12, 3), 30.0, body.skeleton, "half").save(tmp_path / "half.npz")
-    more, plain = (
-        CorrectiveTraining.of(replace(config, uncleared=folders)).wear("train") for folders in ((tmp_path,), ())
-    )
-    assert len(more) - len(plain) == -(-6 // config.every)
-    torch.testing.assert_close(more.rotations[-1], rotations[0])
+    plain = CorrectiveTraining.of(config).wear("train")
+    for kind in ("uncleared", "close"):
+        more = CorrectiveTraining.of(replace(config, **{kind: (tmp_path,)})).wear("train")
+        assert len(more) - len(plain) == -(-6 // config.every)
+        torch.testing.assert_close(more.rotations[-1], rotations[0])
 
 
 def test_an_offset_beyond_its_reach_is_still_made_smaller(config, body):
     """What is held to its reach may not hide how large it would be."""
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
     corrective = training.begin(worn)
-    torch.nn.init.normal_(corrective.layers[-1].weight, std=5.0, generator=torch.Generator().manual_seed(1))  # pyright: ignore[reportArgumentType]
+    torch.nn.init.normal_(corrective.last, std=5.0, generator=torch.Generator().manual_seed(1))
     contacts = training.contacts(corrective, worn)
     far = float(corrective.unbounded(worn.rotations, worn.betas, worn.latents).detach().square().sum(-1).mean().sqrt())
     assert far > 2 * REACH

@@ -8,6 +8,7 @@ import onnxruntime
 import pytest
 import torch
 
+from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import (
     Regressor,
     TrainRegressorConfig,
@@ -78,8 +79,12 @@ def test_onnx_gives_what_torch_gives(tryon, motion):
 
 
 def test_onnx_files_are_written_and_run(tryon, tmp_path):
-    written = write_onnx(tmp_path, tryon.regressor, tryon.subspace)
-    assert [path.name for path in written] == ["tshirt-regressor.onnx", "tshirt-decoder.onnx"]
+    corrective = TryOn.shipped("tshirt").corrective
+    assert isinstance(corrective, PosedCorrective)
+    written = write_onnx(tmp_path, tryon.regressor, tryon.subspace, corrective)
+    kinds = ["regressor", "decoder", "corrective"]
+    assert [path.name for path in written] == [f"tshirt-{kind}.onnx" for kind in kinds]
+    assert write_onnx(tmp_path, tryon.regressor, tryon.subspace) == written[:2]
     session = onnxruntime.InferenceSession(str(written[1]))
     (X,) = session.run(None, {"latent": np.zeros((1, 25), np.float32)})
     with torch.no_grad():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from workbench.collisions.limb_sight import LimbSight
 from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
@@ -13,6 +14,7 @@ from workbench.collisions.tryon_kernels import KernelCorrective, KernelNetworks,
 from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.extras import MissingExtra
 from workbench.formats import load_motion, motion_files
+from workbench.geometry.patches import Patches
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +86,10 @@ def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
 @pytest.mark.parametrize("size", [5, 500])  # 500: far beyond its reach
 def test_a_corrective_in_kernels_gives_what_torch_gives(tryon, size):
     chance = torch.Generator().manual_seed(2)
-    corrective = PosedCorrective("tshirt", 31, 10, size * torch.randn(16, 3 * 4630, generator=chance), 64, chance)
+    patches = Patches.of(tryon.garment.vertices, 12)
+    basis = size * torch.randn(16, 3 * patches.vertices.numel(), generator=chance)
+    sight = LimbSight.of(tryon.model.body, tryon.model.fields, patches.centres(tryon.garment.vertices))
+    corrective = PosedCorrective("tshirt", patches, sight, basis, 64, chance)
     with torch.no_grad():
         for parameter in corrective.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=chance)

@@ -3,9 +3,10 @@
 Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds space, and a canonical garment that
 touches nothing ends inside the posed body (facts.md 9).  25 latents cannot say where: pushing the regressor's own
 output (tried before) took a third of the collisions off and cost 2.4 mm of vertex error.  This network adds an offset
-C(theta, beta, x_bar) of low rank to D(x_bar).  It learns from `ContactPlanes` alone, on training motions worn by
-random shapes, cleared for them; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on
-C and on its Laplacian keeps it away from where it is not needed.
+C(theta, beta, x_bar) to D(x_bar): each of many overlapping patches mixes a basis of its own, by what it sees of the
+limbs about it (`limb_sight`).  It learns from `ContactPlanes` alone, on training motions worn by random shapes, cleared
+for them or with room; no ground truth.  Eq. 16's hinge keeps X + C out of the canonical body, a penalty on C and on its
+Laplacian keeps it away from where it is not needed.
 """
 
 import json
@@ -25,12 +26,14 @@ from workbench.collisions.canonical_set import CanonicalSet
 from workbench.collisions.contact_planes import ContactPlanes
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
+from workbench.collisions.limb_sight import LimbSight
 from workbench.collisions.posed_distance import PosedDistance
 from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import LATENTS, Subspace
 from workbench.collisions.worn_poses import Jitter, Wearer, WornPoses, with_room
 from workbench.formats import load_motion, motion_files
 from workbench.geometry.laplacian import apply_laplacian, umbrella_laplacian
+from workbench.geometry.patches import Patches
 from workbench.learning.batches import random_rows
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.network_file import read_network, write_network
@@ -39,16 +42,15 @@ from workbench.motion import Motion
 
 log = logging.getLogger(__name__)
 
-FORMAT = "corrective-1"
+FORMAT = "corrective-2"
+TRAIN_IT = "train it with `workbench train corrective`"
 MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
-# Diffused weight above which a joint moves a garment.  Such joints and their children are seen.  Others, the fingers of
-# a body in a T-shirt, say nothing, but a network that saw them would believe what training motions do with them.
-MOVES = 0.05
+FIRST_OWN = 0.5  # standard deviation of the biases by which patches differ at first
 ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
-# Metres, root mean square over the garment, that an offset may have.  Looked at in pictures: test motions ask for up to
-# 52 mm (T-shirt) and 23 mm (dress), two clips of mocap with a pelvis that turns about in a few frames for 105 mm
-REACH = 0.06
+# Metres, root mean square over the garment, that an offset may have: a guard.  Motions that bodies can take, and four
+# clips with errors of capture among them, ask for up to 72 mm of a T-shirt, rolling and getting up for up to 80
+REACH = 0.1
 FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
 
 
@@ -79,55 +81,74 @@ class TrainCorrectiveConfig:
     motions: tuple[Path, ...] = ()
     # The same, but not cleared: those of their poses are learned from that leave cloth room.
     uncleared: tuple[Path, ...] = ()
+    # Uncleared ones of bodies that are folded up: there skin is on skin, and it is enough that it is not in it.
+    close: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
-    rank: int = 96  # offsets that are mixed
-    width: int = 512  # of the layers that say how much of each
+    patches: int = 64  # of the garment, overlapping
+    rank: int = 16  # offsets that are mixed in each
+    width: int = 128  # of the layers that say how much of each
     weights: CorrectiveWeights = CorrectiveWeights()  # of the terms of the loss
     jitter: Jitter = Jitter()  # what is added to poses, shapes and latents, at every look
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
-    round_poses: int = 2000  # jittered poses whose contacts are looked at ...
-    round_steps: int = 800  # ... and learned from for so many steps
+    round_poses: int = 1000  # jittered poses whose contacts are looked at ...
+    round_steps: int = 400  # ... and learned from for so many steps
     batch: int = 32  # poses a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=24_000, learning_rate=2e-3, clip_norm=50.0))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=16_000, learning_rate=2e-3, clip_norm=50.0))
     seed: int = 0
 
 
 class PosedCorrective(nn.Module):
-    """C(theta, beta, x_bar): two dense layers, ReLU and LayerNorm each, then amounts of a learned basis."""
+    """C(theta, beta, x_bar): each patch, from what it sees of the limbs, mixes its own basis.
+
+    Two dense layers, ReLU and LayerNorm each, whose weights all patches share; a patch has biases, amounts and a basis
+    of its own.
+    """
 
     def __init__(
         self,
         garment_name: str,
-        joints: int,
-        shapes: int,
-        basis: Float[Tensor, "R N3"],
-        width: int = 512,
+        patches: Patches,
+        sight: LimbSight,
+        basis: Float[Tensor, "R P3n"],
+        width: int = 128,
         generator: torch.Generator | None = None,
     ):
-        """basis: amounts -> flattened offsets, millimetres."""
+        """basis: of each patch, amounts -> flattened offsets, millimetres; beside each other."""
         super().__init__()
         generator = generator or torch.Generator().manual_seed(0)
-        self.garment_name, self.joints, self.shapes = garment_name, joints, shapes
-        inputs = 9 * (joints - 1) + shapes + LATENTS
-        layers: list[nn.Module] = []
-        for size in (inputs, width):
-            dense = nn.Linear(size, width)
-            nn.init.kaiming_uniform_(dense.weight, nonlinearity="relu", generator=generator)
-            nn.init.zeros_(dense.bias)
-            layers += [dense, nn.ReLU(), nn.LayerNorm(width, eps=1e-3)]
-        last = nn.Linear(width, len(basis))
-        nn.init.zeros_(last.weight)  # it begins by correcting nothing
-        nn.init.zeros_(last.bias)
-        self.layers = nn.Sequential(*layers, last)
+        self.garment_name, self.patches, self.sight = garment_name, patches, sight
+        count = len(patches)
+
+        def dense(inputs: int) -> nn.Parameter:
+            weight = torch.empty(width, inputs)
+            nn.init.kaiming_uniform_(weight, nonlinearity="relu", generator=generator)
+            return nn.Parameter(weight.T.contiguous())
+
+        def own() -> nn.Parameter:
+            return nn.Parameter(FIRST_OWN * torch.randn(count, width, generator=generator))
+
+        self.first, self.second = dense(sight.size + sight.shapes + LATENTS), dense(width)
+        self.first_own, self.second_own = own(), own()
+        self.first_norm, self.second_norm = nn.LayerNorm(width, eps=1e-3), nn.LayerNorm(width, eps=1e-3)
+        self.last = nn.Parameter(torch.zeros(count, width, len(basis)))  # it begins by correcting nothing
+        self.last_own = nn.Parameter(torch.zeros(count, len(basis)))
         self.basis = nn.Parameter(basis.clone())
         self.story: dict = {}
 
     @property
     def vertex_count(self) -> int:
-        return self.basis.shape[1] // 3
+        return self.patches.point_count
+
+    @property
+    def joints(self) -> int:
+        return len(self.sight.parents)
+
+    @property
+    def shapes(self) -> int:
+        return self.sight.shapes
 
     def forward(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
@@ -140,43 +161,52 @@ class PosedCorrective(nn.Module):
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
     ) -> Float[Tensor, "*B N 3"]:
         """The same before it is held to REACH: what training keeps small."""
-        pose = (rotations[..., 1:, :, :] - torch.eye(3)).flatten(-3)
-        seen = torch.cat([pose, FEATURE_SCALE * betas, FEATURE_SCALE * latent], dim=-1)
-        return (self.layers(seen) @ self.basis).unflatten(-1, (-1, 3)) / MILLI
+        of_all = FEATURE_SCALE * torch.cat([betas, latent], dim=-1)
+        first, common = self.first.split([self.sight.size, of_all.shape[-1]])
+        hidden = self.sight(rotations, betas) @ first + (of_all @ common)[..., None, :] + self.first_own
+        hidden = self.first_norm(torch.relu(hidden)) @ self.second + self.second_own
+        hidden = self.second_norm(torch.relu(hidden))
+        return self.mixed((hidden[..., None, :] @ self.last)[..., 0, :] + self.last_own) / MILLI
 
-    def ignore(self, joints: Sequence[int]) -> None:
-        """Make the offset independent of these joints' rotations, also while it learns."""
-        first = self.layers[0]
-        assert isinstance(first, nn.Linear)
-        kept = torch.ones_like(first.weight)
-        for joint in joints:
-            if joint > 0:
-                kept[:, 9 * (joint - 1) : 9 * joint] = 0.0
-        first.weight.data.mul_(kept)
-        first.weight.register_hook(lambda gradient: gradient * kept)
+    def mixed(self, amounts: Float[Tensor, "*B P R"]) -> Float[Tensor, "*B N 3"]:
+        """Offsets of amounts, millimetres."""
+        count, rank = amounts.shape[-2:]
+        basis = self.basis.unflatten(1, (count, -1)).transpose(0, 1)  # (P,R,3n)
+        values = amounts.reshape(-1, count, rank).transpose(0, 1) @ basis  # (P,B,3n)
+        offsets = self.patches.spread(values.transpose(0, 1).unflatten(-1, (-1, 3)))
+        return offsets.reshape(*amounts.shape[:-2], *offsets.shape[-2:])
 
     def save(self, path: Path) -> None:
         """The parameters, with what made them; the basis as int8, a hundredth or two of an offset."""
         metadata = {
             "format": FORMAT,
             "garment": self.garment_name,
-            "joints": str(self.joints),
-            "shapes": str(self.shapes),
+            "parents": json.dumps(self.sight.parents),
             "story": json.dumps(self.story),
         }
-        write_network(self, path, metadata, coarse={"basis": 0})
+        patches = {"patches.vertices": self.patches.vertices.int(), "patches.windows": self.patches.windows.half()}
+        write_network(self, path, metadata, coarse={"basis": 0}, beside=patches)
 
     @staticmethod
     def load(path: str | Path) -> "PosedCorrective":
         """Read what `save` wrote.  Raises FileNotFoundError, or ValueError for a damaged or foreign file."""
-        found = read_network(Path(path), "train it with `workbench train corrective`")
-        metadata = found.metadata
+        found = read_network(Path(path), TRAIN_IT)
+        metadata, tensors = found.metadata, found.tensors
         if metadata.get("format") != FORMAT:
-            raise ValueError(f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r})")
-        basis, width = found.tensors["basis"], len(found.tensors["layers.0.bias"])
-        sizes = (int(metadata["joints"]), int(metadata["shapes"]))
-        corrective = PosedCorrective(metadata["garment"], *sizes, torch.zeros_like(basis), width)
-        corrective.load_state_dict(found.tensors)
+            raise ValueError(
+                f"{path} is no corrective (format {metadata.get('format')!r}, expected {FORMAT!r}); {TRAIN_IT}"
+            )
+        try:
+            basis, (count, width) = tensors["basis"], tensors["first_own"].shape
+            places, windows = (tensors.pop(f"patches.{name}") for name in ("vertices", "windows"))
+            patches = Patches(places.long(), windows).checked(basis.shape[1] // 3)
+            bones, shapes = len(tensors["sight.ends"]), len(tensors["sight.offsets"])
+            sight = LimbSight(json.loads(metadata["parents"]), count, shapes, bones)
+            corrective = PosedCorrective(metadata["garment"], patches, sight, torch.zeros_like(basis), width)
+            corrective.load_state_dict(tensors)
+        except (KeyError, ValueError, RuntimeError) as error:
+            what = " ".join(str(error).split())  # torch tells it in several lines
+            raise ValueError(f"network {path} is damaged ({what}); {TRAIN_IT}") from error
         corrective.story = json.loads(metadata["story"])
         return corrective.eval()
 
@@ -229,14 +259,8 @@ class CorrectiveTraining:
     def laplacian(self) -> Float[Tensor, "N N"]:
         return umbrella_laplacian(self.data.garment.faces, len(self.data.mean))
 
-    def unseen_joints(self) -> list[int]:
-        """Joints that neither move the garment nor hang on one that does."""
-        body = self.model.body
-        moves = self.model.fields.weights(self.data.garment.vertices).amax(dim=0) > MOVES
-        return [joint for joint in range(1, len(moves)) if not (moves[joint] or moves[body.parents[joint]])]
-
     def wear(self, split: str) -> WornPoses:
-        """The motions of a split on random shapes; training also takes those of `motions` and `uncleared`."""
+        """The motions of a split on random shapes; training also takes those of `motions`, `uncleared` and `close`."""
         config, body, fps = self.config, self.model.body, self.data.fps
         motions = [
             Motion(s.rotations, s.translation, fps, body.skeleton, s.motion_name) for s in self.data.of_split(split)
@@ -247,9 +271,12 @@ class CorrectiveTraining:
         kept = config.out / "work" / "cleared"
         wearer = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)
         worn = with_room(wearer(motions), self.garments, body)
-        if split == "train" and config.uncleared:
-            loose = wearer.uncleared(_motions_in(config.uncleared, body))
-            worn = WornPoses.joined([worn, with_room(loose, self.garments, body, ROOM)])
+        if split == "train":
+            for folders, room in ((config.uncleared, ROOM), (config.close, 0.0)):
+                if folders:
+                    more = wearer.uncleared(_motions_in(folders, body))
+                    worn = WornPoses.joined([worn, with_room(more, self.garments, body, room)])
+        log.info("%d poses of the %s motions", len(worn), split)
         return worn
 
     def garments(self, worn: WornPoses) -> Float[Tensor, "B N 3"]:
@@ -272,23 +299,27 @@ class CorrectiveTraining:
         short = (self.config.weights.posed_clearance - distance.detach()).clamp_min(0.0)
         return (local.rotation.mT @ (short[..., None] * away)[..., None])[..., 0]
 
-    def first_basis(self, worn: WornPoses) -> Float[Tensor, "R N3"]:
-        """Principal directions of the needed corrections of some frames, millimetres."""
+    def first_basis(self, worn: WornPoses, patches: Patches) -> Float[Tensor, "R P3n"]:
+        """Principal directions, on each patch, of the needed corrections of some frames; millimetres."""
         generator = torch.Generator().manual_seed(self.config.seed + 1)
         some = torch.randperm(len(worn), generator=generator)[: self.config.first_frames]
-        needed = torch.cat([self.needed(worn[part]).flatten(1) for part in some.split(16)])
-        _, size, directions = torch.linalg.svd(needed, full_matrices=False)
-        rank = min(self.config.rank, len(size))
-        return MILLI * FIRST_GAIN * directions[:rank] * (size[:rank, None] / len(needed) ** 0.5 + 1e-6)
+        needed = torch.cat([self.needed(worn[part]) for part in some.split(16)])
+        of_patches = needed[:, patches.vertices].transpose(0, 1).flatten(2)  # (P,F,3n)
+        _, size, directions = torch.linalg.svd(of_patches, full_matrices=False)
+        rank = min(self.config.rank, size.shape[1])
+        scaled = directions[:, :rank] * (size[:, :rank, None] / len(needed) ** 0.5 + 1e-6)
+        return MILLI * FIRST_GAIN * scaled.transpose(0, 1).flatten(1)
 
     def begin(self, worn: WornPoses) -> PosedCorrective:
         """What training begins with: a corrective that corrects nothing, or `start`."""
         if self.start is not None:
             return self.start
         config, body = self.config, self.model.body
-        basis = self.first_basis(worn)
-        sizes = (self.data.garment_name, len(body.parents), body.shape_count)
-        return PosedCorrective(*sizes, basis, config.width, torch.Generator().manual_seed(config.seed))
+        mean = self.data.mean.reshape(-1, 3)
+        patches = Patches.of(mean, config.patches)
+        sight = LimbSight.of(body, self.model.fields, patches.centres(mean))
+        basis, chance = self.first_basis(worn, patches), torch.Generator().manual_seed(config.seed)
+        return PosedCorrective(self.data.garment_name, patches, sight, basis, config.width, chance)
 
     def loss(self, corrective: PosedCorrective, contacts: ContactPlanes) -> Float[Tensor, ""]:
         """The terms of `CorrectiveWeights`, of one batch."""
@@ -354,7 +385,6 @@ def train(training: CorrectiveTraining, worn: Mapping[str, WornPoses], work: Pat
         if not len(poses):
             raise ValueError(f"no pose of the {split} motions leaves room for the {name}; take others")
     corrective = training.begin(worn["train"])
-    corrective.ignore(training.unseen_joints())
     curves: list[ScalarLog] = []
     contacts: list[ContactPlanes] = []  # of the round
 

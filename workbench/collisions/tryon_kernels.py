@@ -14,8 +14,11 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from workbench.collisions.limb_kernels import add_rectify_and_normalise, mix_patches, see_limbs
+from workbench.collisions.limb_sight import FAR
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
 from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, REACH, PosedCorrective
+from workbench.collisions.posing_kernels import joint_transforms
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, Subspace
 from workbench.collisions.tryon import Networks, TryOn
@@ -124,31 +127,97 @@ class KernelNetworks(Networks):
 
 
 class KernelCorrective:
-    """C(theta, beta, x_bar) of one frame; of many at once, as torch has it."""
+    """C(theta, beta, x_bar) of one frame; of many at once, as torch has it.
+
+    Layers that all patches share are matrix products of numpy, which read their weights once for all.
+    """
 
     @torch.no_grad()
     def __init__(self, corrective: PosedCorrective):
         """Raises ValueError for networks that are not as files hold them."""
-        self.corrective = corrective
-        first = corrective.layers[0]
-        assert isinstance(first, nn.Linear)
-        self.inputs = np.zeros(first.in_features, np.float32)
-        self.trunk = Trunk("the corrective's", corrective.layers, self.inputs)
-        basis = corrective.basis.T
-        self.spread = Dense("the corrective's basis", basis, basis.new_zeros(len(basis)), self.trunk.outputs)
+        self.corrective, sight = corrective, corrective.sight
+        count, joints, rank = len(corrective.patches), corrective.joints, len(corrective.basis)
+        self.rotations, self.rest = np.empty((joints, 3, 3), np.float32), np.empty((joints, 3), np.float32)
+        self.anchors, self.features = np.empty((count, 3), np.float32), np.empty((count, sight.size), np.float32)
+        self.shape = np.full(corrective.shapes, np.nan, np.float32)  # whose joints and anchors these are
+        world, places = wp.zeros(joints, wp.mat33, device="cpu"), wp.zeros(joints, wp.vec3, device="cpu")
+        transforms = wp.zeros((joints, LANES), wp.float32, device="cpu")
+        starts, ends = (shared_array(bone.int().numpy(), wp.int32) for bone in sight.bones())
+        parents = shared_array(np.array(sight.parents, np.int32), wp.int32)
+        rest, rotations = shared_array(self.rest, wp.vec3), shared_array(self.rotations, wp.mat33)
+        unmoved, weights = wp.zeros(1, wp.vec3, device="cpu"), shared_array(sight.weights.numpy(), wp.float32, 2)
+        skeleton = Recorded(joint_transforms, 1, parents, rest, rotations, unmoved, world, places, transforms)
+        seen = (shared_array(self.features, wp.float32, 2),)
+        anchors = shared_array(self.anchors, wp.vec3)
+        self.seeing = [
+            skeleton,
+            Recorded(see_limbs, count, anchors, weights, transforms, world, places, starts, ends, FAR, *seen),
+        ]
+        first, own = corrective.first.split([sight.size, len(corrective.first) - sight.size])
+        self.first, self.own, self.second = first.numpy(), own.numpy(), corrective.second.numpy()
+        self.hidden = [np.empty((count, self.first.shape[1]), np.float32) for _ in range(2)]
+        self.common = [np.zeros(self.first.shape[1], np.float32) for _ in range(2)]
+        self.rectifying: list[Recorded] = []
+        layers = ((corrective.first_own, corrective.first_norm), (corrective.second_own, corrective.second_norm))
+        for (shift, norm), hidden, common in zip(layers, self.hidden, self.common, strict=True):
+            vectors = (shared_array(v.detach().numpy(), wp.float32) for v in (norm.weight, norm.bias))
+            given = (shared_array(common, wp.float32), shared_array(shift.detach().numpy(), wp.float32, 2), *vectors)
+            values = shared_array(hidden, wp.float32, 2)
+            self.rectifying.append(Recorded(add_rectify_and_normalise, count, *given, norm.eps, values))
+        self.last, self.last_own = corrective.last.numpy(), corrective.last_own.numpy()
+        self.amounts = np.empty((count, rank), np.float32)
+        blocks, size = _patch_blocks(corrective)
+        self.values = np.empty((count, size), np.float32)
+        self.points = corrective.patches.vertices.shape[1]
+        self.mixing = Recorded(
+            mix_patches,
+            blocks.size // (LANES * rank),
+            size // LANES,
+            shared_array(blocks, wp.float16),
+            shared_array(self.amounts, wp.float32, 2),
+            shared_array(self.values.reshape(-1), wp.float32),
+        )
+        self.matrix = corrective.patches.matrix
 
     def __call__(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
     ) -> Float[Tensor, "*B N 3"]:
         if latent.dim() > 1:
             return self.corrective(rotations, betas, latent)
-        pose = (rotations.numpy()[1:] - np.eye(3, dtype=np.float32)).reshape(-1)
-        np.concatenate([pose, FEATURE_SCALE * betas.numpy(), FEATURE_SCALE * latent.numpy()], out=self.inputs)
-        for call in (*self.trunk.calls, self.spread.call):
+        if not np.array_equal(self.shape, betas.numpy()):
+            self.shape = betas.numpy().copy()
+            self.rest[:], self.anchors[:] = (found.numpy() for found in self.corrective.sight.at_rest(betas))
+        self.rotations[:] = rotations.numpy()
+        self.rotations[0] = np.eye(3)
+        for call in self.seeing:
             call()
-        flat = self.spread.outputs
-        size = math.sqrt(3 * float(flat @ flat) / len(flat)) / MILLI  # metres: `within_reach` of one frame
-        return torch.from_numpy(flat * np.float32(REACH / max(size, REACH) / MILLI)).reshape(-1, 3)
+        np.matmul(FEATURE_SCALE * np.concatenate([self.shape, latent.numpy()]), self.own, out=self.common[0])
+        np.matmul(self.features, self.first, out=self.hidden[0])
+        self.rectifying[0]()
+        np.matmul(self.hidden[0], self.second, out=self.hidden[1])
+        self.rectifying[1]()
+        np.matmul(self.hidden[1][:, None], self.last, out=self.amounts[:, None])
+        self.amounts += self.last_own
+        self.mixing()
+        offset = self.matrix @ self.values[:, : 3 * self.points].reshape(-1, 3)
+        size = math.sqrt(float(np.vdot(offset, offset)) / len(offset)) / MILLI  # metres: `within_reach` of one frame
+        return torch.from_numpy(offset * np.float32(REACH / max(size, REACH) / MILLI))
+
+
+def _patch_blocks(corrective: PosedCorrective) -> tuple[np.ndarray, int]:
+    """The basis as `mix_patches` reads it, and the values of a patch, filled up to whole blocks."""
+    rank, count = len(corrective.basis), len(corrective.patches)
+    basis = corrective.basis.detach().unflatten(1, (count, -1))
+    if not torch.equal(basis.half().float(), basis):
+        raise ValueError(
+            "the corrective's basis is not exact in float16, as one that was loaded from its file is; save and load it "
+            "first"
+        )
+    size = -(-basis.shape[2] // LANES) * LANES
+    padded = np.zeros((count, size, rank), np.float16)
+    padded[:, : basis.shape[2]] = basis.permute(1, 2, 0).numpy()
+    blocks = padded.reshape(count, size // LANES, LANES, rank).transpose(0, 1, 3, 2)
+    return np.ascontiguousarray(blocks).reshape(-1), size
 
 
 def quickest(tryon: TryOn) -> TryOn:

@@ -1,10 +1,10 @@
-"""6.3: the runtime's networks as ONNX.  Regressor, Subspace <-> two graphs, one frame a call.
+"""6.3: the runtime's networks as ONNX.  Regressor, Subspace, corrective <-> graphs, one frame a call.
 
 The graphs are written operator by operator (GRU, Gemm, LayerNormalization), so that nothing of torch is needed to run
-them: `regressor.onnx` inputs (1,1,I), hidden (2,1,H) -> latent (1,L), next hidden; `decoder.onnx` latent -> X (1,3N).
+them: `regressor.onnx` inputs (1,1,I), hidden (2,1,H) -> latent (1,L), next hidden; `decoder.onnx` latent -> X (1,3N);
+`corrective.onnx` (see `corrective_onnx`) -> C (N,3).
 """
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,51 +13,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from workbench.collisions.corrective_onnx import corrective_graph
 from workbench.collisions.motion_descriptor import DESCRIPTOR_SIZE
+from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import LATENTS, Decoder, DenseDecoder, Subspace
 from workbench.collisions.tryon import Networks
 from workbench.extras import require
+from workbench.learning.onnx_graph import Graph
 from workbench.store import atomic_write
 
-OPSET = 20
 GATES = (1, 0, 2)  # torch stores reset, update, new; ONNX update, reset, new
-
-
-@dataclass
-class Graph:
-    """Nodes and constants of a graph that is being written."""
-
-    nodes: list[Any] = field(default_factory=list)
-    constants: list[Any] = field(default_factory=list)
-
-    def constant(self, name: str, value: Tensor | np.ndarray) -> str:
-        onnx: Any = require("onnx", extra="runtime")
-        array = value.detach().numpy() if isinstance(value, Tensor) else value
-        self.constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
-        return name
-
-    def node(self, operator: str, inputs: list[str], outputs: list[str], **attributes: Any) -> str:
-        onnx: Any = require("onnx", extra="runtime")
-        self.nodes.append(onnx.helper.make_node(operator, inputs, outputs, **attributes))
-        return outputs[0]
-
-    def dense(self, name: str, layer: nn.Linear, source: str) -> str:
-        weight, bias = self.constant(f"{name}.weight", layer.weight), self.constant(f"{name}.bias", layer.bias)
-        return self.node("Gemm", [source, weight, bias], [name], transB=1)
-
-    def model(self, name: str, inputs: dict[str, list[int]], outputs: dict[str, list[int]]) -> Any:
-        onnx: Any = require("onnx", extra="runtime")
-
-        def declared(shapes: dict[str, list[int]]) -> list[Any]:
-            kind = onnx.TensorProto.FLOAT
-            return [onnx.helper.make_tensor_value_info(key, kind, shape) for key, shape in shapes.items()]
-
-        graph = onnx.helper.make_graph(self.nodes, name, declared(inputs), declared(outputs), self.constants)
-        opsets = [onnx.helper.make_opsetid("", OPSET)]
-        model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=10, producer_name="garment-workbench")
-        onnx.checker.check_model(model)
-        return model
 
 
 def regressor_graph(regressor: Regressor) -> Any:
@@ -124,10 +90,15 @@ def decoder_graph(subspace: Subspace) -> Any:
     return graph.model("decoder", {"latent": [1, LATENTS]}, {"X": [1, 3 * subspace.vertex_count]})
 
 
-def write_onnx(folder: Path, regressor: Regressor, subspace: Subspace) -> list[Path]:
-    """regressor.onnx and decoder.onnx in the folder, each whole or not at all."""
+def write_onnx(
+    folder: Path, regressor: Regressor, subspace: Subspace, corrective: PosedCorrective | None = None
+) -> list[Path]:
+    """regressor.onnx, decoder.onnx and, where there is one, corrective.onnx in the folder, each whole or not at all."""
+    models = {"regressor": regressor_graph(regressor), "decoder": decoder_graph(subspace)}
+    if corrective is not None:
+        models["corrective"] = corrective_graph(corrective)
     written = []
-    for name, model in (("regressor", regressor_graph(regressor)), ("decoder", decoder_graph(subspace))):
+    for name, model in models.items():
         path = folder / f"{subspace.garment_name}-{name}.onnx"
         with atomic_write(path) as part:
             part.write_bytes(model.SerializeToString())
