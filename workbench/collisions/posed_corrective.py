@@ -48,8 +48,8 @@ MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
 FIRST_OWN = 0.5  # standard deviation of the biases by which patches differ at first
 ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
-# Metres, root mean square over the garment, that an offset may have: a guard.  Motions that bodies can take, and four
-# clips with errors of capture among them, ask for up to 72 mm of a T-shirt, rolling and getting up for up to 80
+# Metres, root mean square over the garment, that an offset may have: a guard.  21 clips of mocap, errors of capture and
+# getting up from the floor among them, ask for up to 109 mm of the T-shirt; walking for 20
 REACH = 0.1
 FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
 
