@@ -1,5 +1,6 @@
 """Laws of the corrective against collisions in posed space, small and hardly trained."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -178,6 +179,13 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     other.save(tmp_path / "whole.safetensors")
     with safe_open(tmp_path / "whole.safetensors", framework="pt") as file:
         tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    odd = {**tensors, "sight.ends": tensors["sight.ends"] + 100}
+    save_file(odd, tmp_path / "odd.safetensors", metadata=metadata)
+    with pytest.raises(ValueError, match=r"odd.safetensors is damaged \(bones that end at no joint"):
+        PosedCorrective.load(tmp_path / "odd.safetensors")
+    save_file(tensors, tmp_path / "odd.safetensors", metadata={**metadata, "parents": json.dumps([40] * 31)})
+    with pytest.raises(ValueError, match=r"odd.safetensors is damaged \(joints that hang on none"):
+        PosedCorrective.load(tmp_path / "odd.safetensors")
     del tensors["last"]
     save_file(tensors, tmp_path / "part.safetensors", metadata=metadata)
     with pytest.raises(ValueError, match=r"part.safetensors is damaged .*last"):

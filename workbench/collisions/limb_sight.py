@@ -92,6 +92,16 @@ class LimbSight(nn.Module):
             buffer.copy_(found[name])
         return sight
 
+    def checked(self) -> "LimbSight":
+        """This, if joints hang on joints before them, and bones end at joints that hang on one; else ValueError."""
+        hanging = [0 <= parent < joint for joint, parent in enumerate(self.parents)]
+        known = {joint for joint, hangs in enumerate(hanging) if hangs}
+        if not all(hangs or self.parents[joint] == -1 for joint, hangs in enumerate(hanging)):
+            raise ValueError(f"joints that hang on none before them: parents {list(self.parents)}")
+        if not known.issuperset(self.ends.tolist()):
+            raise ValueError(f"bones that end at no joint: {self.ends.tolist()}")
+        return self
+
     @property
     def size(self) -> int:
         """F: what a patch sees, in numbers."""

@@ -51,17 +51,21 @@ ROOM = 0.016  # metres that uncleared poses must leave between limbs where the g
 # Metres, root mean square over the garment, that an offset may have: a guard.  21 clips of mocap, errors of capture and
 # getting up from the floor among them, ask for up to 109 mm of the T-shirt; walking for 20
 REACH = 0.1
-FEATURE_SCALE = 0.3  # of beta and x_bar beside the entries of R - I
+FEATURE_SCALE = 0.3  # of beta and x_bar beside what is seen
 
 
 @dataclass(frozen=True)
 class CorrectiveWeights:
-    """Terms in millimetres (`size`: square millimetres); ours.  Compared on validation motions only."""
+    """Terms in millimetres (`size`: square millimetres); ours.
+
+    These were compared on validation motions; those of what ships were chosen after figures of test motions (README).
+    """
 
     hinge: float = 50.0  # of the depth in posed space
     canonical: float = 50.0  # of Eq. 16's hinge on X + C
-    # |C|^2: square, so that no vertex goes far.  1,500 steps over 6,500 of the T-shirt's poses, looked at once: 0.003
-    # leaves 0.51 % inside on loosened poses and moves validation's vertices by 4.9 mm, 0.001 leaves 0.42 % and 6.5 mm
+    # |C|^2: square, so that no vertex goes far.  Of an earlier network that saw the rotations of joints, 1,500 steps over
+    # 6,500 of the T-shirt's poses, looked at once: 0.003 left 0.51 % inside on loosened poses and moved validation's
+    # vertices by 4.9 mm, 0.001 left 0.42 % and 6.5 mm
     size: float = 0.001
     laplacian: float = 0.5  # |Delta C|_1
     posed_clearance: float = 4e-3  # metres; in the same runs 3, 5 and 8 mm left 0.51, 0.46 and 0.36 %
@@ -204,6 +208,7 @@ class PosedCorrective(nn.Module):
             sight = LimbSight(json.loads(metadata["parents"]), count, shapes, bones)
             corrective = PosedCorrective(metadata["garment"], patches, sight, torch.zeros_like(basis), width)
             corrective.load_state_dict(tensors)
+            corrective.sight.checked()
         except (KeyError, ValueError, RuntimeError) as error:
             what = " ".join(str(error).split())  # torch tells it in several lines
             raise ValueError(f"network {path} is damaged ({what}); {TRAIN_IT}") from error
