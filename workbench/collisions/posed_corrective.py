@@ -63,9 +63,9 @@ class CorrectiveWeights:
 
     hinge: float = 50.0  # of the depth in posed space
     canonical: float = 50.0  # of Eq. 16's hinge on X + C
-    # |C|^2: square, so that no vertex goes far.  Of an earlier network that saw the rotations of joints, 1,500 steps over
-    # 6,500 of the T-shirt's poses, looked at once: 0.003 left 0.51 % inside on loosened poses and moved validation's
-    # vertices by 4.9 mm, 0.001 left 0.42 % and 6.5 mm
+    # |C|^2: square, so that no vertex goes far.  Of an earlier network, which saw the rotations of joints, 1,500 steps
+    # over 6,500 of the T-shirt's poses, looked at once: 0.003 left 0.51 % inside on loosened poses and moved those of
+    # validation by 4.9 mm, 0.001 left 0.42 % and 6.5 mm
     size: float = 0.001
     laplacian: float = 0.5  # |Delta C|_1
     posed_clearance: float = 4e-3  # metres; in the same runs 3, 5 and 8 mm left 0.51, 0.46 and 0.36 %
