@@ -48,7 +48,7 @@ class ScanFitConfig:
     """How one scan is fitted."""
 
     fit: FitConfig = FitConfig(
-        steps=1800, learning_rate=1.2e-2, last_rate=1e-3, warmup=5, clip_norm=1e9, checkpoint_every=10**9
+        steps=2200, learning_rate=1.2e-2, last_rate=1e-3, warmup=5, clip_norm=1e9, checkpoint_every=10**9
     )  # ours: facts.md 2 has 401 steps of 5e-4; larger and falling rates reach the same loss sooner
     weights: LossWeights = LOOSE
     queries: int = 6000  # pixels a step
