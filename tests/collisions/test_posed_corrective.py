@@ -178,7 +178,7 @@ def test_foreign_and_damaged_files_are_refused(tmp_path, config, body):
     other.patches = patches
     other.save(tmp_path / "whole.safetensors")
     with safe_open(tmp_path / "whole.safetensors", framework="pt") as file:
-        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118  not a dict
     odd = {**tensors, "sight.ends": tensors["sight.ends"] + 100}
     save_file(odd, tmp_path / "odd.safetensors", metadata=metadata)
     with pytest.raises(ValueError, match=r"odd.safetensors is damaged \(bones that end at no joint"):

@@ -79,18 +79,13 @@ def _seen(write: Writer, corrective: PosedCorrective) -> str:
     apart = write("Sub", write("Mul", share, along), to)
     square = write("ReduceSum", write("Mul", apart, apart), np.array([2]))
     near = write("Exp", write("Mul", square, np.float32(-0.5 / FAR**2)))
-    own = write(
-        "MatMul", write("Unsqueeze", write("Transpose", A, perm=[0, 2, 1]), np.array([1])), _rows(write, turns, starts)
-    )
+    to_own = write("Unsqueeze", write("Transpose", A, perm=[0, 2, 1]), np.array([1]))
+    own = write("MatMul", to_own, write("Unsqueeze", write("Gather", turns, starts), np.array([0])))
     own = write("Reshape", write("Sub", own, np.eye(3, dtype=np.float32)), np.array([count, len(starts), 9]))
     way = write("Div", write("MatMul", apart, A), np.float32(FAR))
     one = np.ones((count, len(starts), 1), np.float32)
     told = write("Mul", near, write("Concat", one, way, own, axis=2))
     return write("Reshape", told, np.array([count, sight.size]))
-
-
-def _rows(write: Writer, array: str, index: np.ndarray) -> str:
-    return write("Unsqueeze", write("Gather", array, index), np.array([0]))
 
 
 def _amounts(write: Writer, corrective: PosedCorrective, seen: str) -> str:

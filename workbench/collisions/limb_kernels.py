@@ -3,6 +3,8 @@
 
 import warp as wp
 
+from workbench.collisions.network_kernels import normalise
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -95,16 +97,6 @@ def add_rectify_and_normalise(
 ):
     """Of one patch: what all patches and what it alone has is added; ReLU and LayerNorm, in place."""
     row = wp.tid()
-    size = values.shape[1]
-    mean = float(0.0)  # noqa: UP018  a variable for Warp, not a constant
-    square = float(0.0)  # noqa: UP018
-    for i in range(size):
-        value = wp.max(values[row, i] + common[i] + own[row, i], 0.0)
-        values[row, i] = value
-        mean += value
-    mean = mean / float(size)
-    for i in range(size):
-        square += (values[row, i] - mean) * (values[row, i] - mean)
-    factor = 1.0 / wp.sqrt(square / float(size) + epsilon)
-    for i in range(size):
-        values[row, i] = (values[row, i] - mean) * factor * scale[i] + shift[i]
+    for i in range(values.shape[1]):
+        values[row, i] = wp.max(values[row, i] + common[i] + own[row, i], 0.0)
+    normalise(row, scale, shift, epsilon, values)

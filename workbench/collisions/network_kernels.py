@@ -65,23 +65,37 @@ def gru_step(
     hidden[i] = (1.0 - update) * new + update * hidden[i]
 
 
+@wp.func
+def normalise(
+    row: int,
+    scale: wp.array(dtype=wp.float32),
+    shift: wp.array(dtype=wp.float32),
+    epsilon: float,
+    values: wp.array2d(dtype=wp.float32),
+):
+    """LayerNorm of a row, in place."""
+    size = values.shape[1]
+    mean = float(0.0)  # noqa: UP018  a variable for Warp, not a constant
+    for i in range(size):
+        mean += values[row, i]
+    mean = mean / float(size)
+    variance = float(0.0)  # noqa: UP018  a variable for Warp, not a constant
+    for i in range(size):
+        variance += (values[row, i] - mean) * (values[row, i] - mean)
+    factor = 1.0 / wp.sqrt(variance / float(size) + epsilon)
+    for i in range(size):
+        values[row, i] = (values[row, i] - mean) * factor * scale[i] + shift[i]
+
+
 @wp.kernel
 def rectify_and_normalise(
     scale: wp.array(dtype=wp.float32),
     shift: wp.array(dtype=wp.float32),
     epsilon: float,
-    values: wp.array(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
 ):
-    """ReLU and LayerNorm in place; two sums over all, hence one thread."""
-    size = values.shape[0]
-    mean = float(0.0)  # noqa: UP018  a variable for Warp, not a constant
-    for i in range(size):
-        values[i] = wp.max(values[i], 0.0)
-        mean += values[i]
-    mean = mean / float(size)
-    variance = float(0.0)  # noqa: UP018
-    for i in range(size):
-        variance += (values[i] - mean) * (values[i] - mean)
-    factor = 1.0 / wp.sqrt(variance / float(size) + epsilon)
-    for i in range(size):
-        values[i] = (values[i] - mean) * factor * scale[i] + shift[i]
+    """ReLU and LayerNorm of a row, in place."""
+    row = wp.tid()
+    for i in range(values.shape[1]):
+        values[row, i] = wp.max(values[row, i], 0.0)
+    normalise(row, scale, shift, epsilon, values)

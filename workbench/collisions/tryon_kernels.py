@@ -68,7 +68,7 @@ class Trunk:
                 self.outputs = made.outputs
             elif isinstance(layer, nn.LayerNorm):  # the ReLU before it comes with it
                 scale, shift = (shared_array(p.detach().numpy(), wp.float32) for p in (layer.weight, layer.bias))
-                values = shared_array(self.outputs, wp.float32)
+                values = shared_array(self.outputs[None], wp.float32, 2)
                 self.calls.append(Recorded(rectify_and_normalise, 1, scale, shift, layer.eps, values))
 
 
