@@ -30,6 +30,7 @@ from workbench.store import add_to_manifest, code_version
 
 CODE = (
     "workbench.collisions.subspace",
+    "workbench.collisions.mirroring",
     "workbench.collisions.regressor",
     "workbench.collisions.motion_descriptor",
     "workbench.collisions.posed_corrective",

@@ -15,11 +15,13 @@ The map
 | garment model       | 4.2     | 7-8  | workbench.collisions.garment_model | X, beta, theta -> M_G              |
 | projection          | 4.3     | 9-12 | workbench.collisions.projection  | M_G, beta, theta -> X                |
 | training set        | 4.4     |      | workbench.collisions.canonical_set | X (T,N,3) of many sequences <-> file |
+| in a mirror         |         |      | workbench.collisions.mirroring   | training set -> twice as large       |
 | subspace            | 4.4     | 13-16 | workbench.collisions.subspace   | X -> x_bar (25) -> X                 |
 | motion descriptor   | 5       | 17   | workbench.collisions.motion_descriptor | theta, H, K -> gamma (42)      |
 | posed distance      |         |      | workbench.collisions.posed_distance | X, beta, theta -> signed distance |
 | contact planes      |         |      | workbench.collisions.contact_planes | poses, C -> distances, linear in C |
 | regressor           | 5       | 1, 18 | workbench.collisions.regressor  | beta, gamma -> x_bar (T,25)          |
+| limb sight          |         |      | workbench.collisions.limb_sight  | theta, beta -> what patches see      |
 | posed corrective    |         |      | workbench.collisions.posed_corrective | theta, beta, x_bar -> offset of X |
 | try-on              | 5-6     |      | workbench.collisions.tryon       | beta, motion -> posed garment        |
 | one frame, fast     | 4.2     | 7-8  | workbench.collisions.frame_posing | X, theta, H -> M_G                  |

@@ -14,6 +14,7 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.limb_sight import LimbSight
 from workbench.collisions.penetration import penetration
 from workbench.collisions.posed_corrective import (
+    EASY_STRETCH,
     REACH,
     CorrectiveTraining,
     PosedCorrective,
@@ -26,6 +27,7 @@ from workbench.collisions.regressor import Regressor
 from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TryOn, load_tryon
 from workbench.collisions.worn_poses import SHAPE_CUT, Jitter, WornPoses
+from workbench.garments import Garment
 from workbench.geometry.patches import Patches
 from workbench.geometry.rotations import axis_angle_to_matrix
 from workbench.learning.fit import FitConfig
@@ -121,15 +123,17 @@ def test_learning_frees_vertices(config, body):
     training, worn = CorrectiveTraining.of(config), closed_arms(body, 2)
     corrective = training.begin(worn)
     optimizer = torch.optim.Adam(corrective.parameters(), lr=1e-2)
-    first = float(training.loss(corrective, training.contacts(corrective, worn)).detach())
+    first = float(training.loss(corrective, training.contacts(corrective, worn), torch.Generator()).detach())
     for _ in range(2):
         contacts = training.contacts(corrective, worn)
         for _ in range(12):
             optimizer.zero_grad()
-            loss = training.loss(corrective, contacts)
+            loss = training.loss(corrective, contacts, torch.Generator())
             loss.backward()
             optimizer.step()
-    assert float(training.loss(corrective, training.contacts(corrective, worn)).detach()) < 0.5 * first
+    assert (
+        float(training.loss(corrective, training.contacts(corrective, worn), torch.Generator()).detach()) < 0.5 * first
+    )
 
 
 def test_training_writes_a_corrective_that_loads_continues_and_is_used(config, body, small_set):
@@ -263,9 +267,21 @@ def test_an_offset_beyond_its_reach_is_still_made_smaller(config, body):
     contacts = training.contacts(corrective, worn)
     far = float(corrective.unbounded(worn.rotations, worn.betas, worn.latents).detach().square().sum(-1).mean().sqrt())
     assert far > 2 * REACH
-    only = replace(config.weights, hinge=0.0, canonical=0.0, laplacian=0.0)
-    replace(training, config=replace(config, weights=only)).loss(corrective, contacts).backward()
+    only = replace(config.weights, hinge=0.0, canonical=0.0, laplacian=0.0, stretch=0.0)
+    replace(training, config=replace(config, weights=only)).loss(corrective, contacts, torch.Generator()).backward()
     assert float(corrective.basis.grad.norm()) > 0  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_cloth_may_give_a_little_but_not_be_drawn_long(config):
+    """An offset that moves all cloth as one stretches nothing; twice the excess of another costs four times."""
+    training, garment = CorrectiveTraining.of(config), Garment.load("tshirt")
+    rest = 1e3 * garment.rest_vertices[None]
+    rigid = torch.tensor([30.0, -20.0, 10.0]).expand_as(rest)
+    assert float(training.stretch(rigid, torch.Generator())) == 0
+    assert float(training.stretch(0.9 * EASY_STRETCH * rest, torch.Generator())) == 0
+    once, twice = (float(training.stretch(x * rest, torch.Generator())) for x in (EASY_STRETCH + 0.5, EASY_STRETCH + 1))
+    assert once == pytest.approx(0.25, rel=1e-3)
+    assert twice == pytest.approx(4 * once, rel=1e-3)
 
 
 def test_motions_without_room_for_the_garment_are_refused(config, body, tmp_path):

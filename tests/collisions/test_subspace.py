@@ -12,6 +12,7 @@ from workbench.collisions.body_sdf import BodySDF
 from workbench.collisions.canonical_set import CanonicalSequence, CanonicalSet
 from workbench.collisions.subspace import (
     LATENTS,
+    Decoder,
     LossWeights,
     NetworkConfig,
     Statistics,
@@ -223,3 +224,35 @@ def test_a_set_of_another_garment_is_refused(small_config, tmp_path):
     foreign.save(tmp_path / "dress.npz")
     with pytest.raises(ValueError, match="4630 vertices, but garment 'dress'"):
         SubspaceTraining.of(replace(small_config, data=tmp_path / "dress.npz"))
+
+
+def test_codes_of_training_frames_are_white():
+    """What random garments are drawn from is where the real ones lie."""
+    data = made_up_set()
+    subspace = Subspace("tshirt", Statistics.of(data, SMALL), SMALL)
+    frames = data.garments(data.kept("train"))
+    codes = subspace.encode(frames)
+    torch.testing.assert_close(codes.std(0), torch.ones(LATENTS), atol=1e-3, rtol=0)
+
+
+def test_codes_give_back_what_lies_in_the_components_where_the_network_adds_nothing():
+    data = made_up_set()
+    subspace = Subspace("tshirt", Statistics.of(data, SMALL), SMALL)
+    assert isinstance(subspace.decoder, Decoder)
+    torch.nn.init.zeros_(subspace.decoder.amounts.weight)
+    codes = torch.randn(5, LATENTS, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(subspace.encode(subspace.decode(codes)), codes, atol=1e-4, rtol=0)
+    assert float(subspace.decode_watched(codes)[1]) < 0.02  # of the root that keeps its gradient finite
+
+
+def test_departure_is_how_far_vertices_are_off_the_linear_garment():
+    data = made_up_set()
+    subspace = Subspace("tshirt", Statistics.of(data, SMALL), SMALL)
+    codes = torch.randn(5, LATENTS, generator=torch.Generator().manual_seed(0))
+    decoder = subspace.decoder
+    assert isinstance(decoder, Decoder)
+    garments, departed = subspace.decode_watched(codes)
+    torch.testing.assert_close(garments, subspace.decode(codes))
+    linear = decoder.mixed(codes, torch.zeros(5, len(decoder.basis)))
+    off = 1e3 * (garments - linear).square().sum(-1).mean(-1).sqrt().mean()
+    torch.testing.assert_close(departed, off, atol=1e-3, rtol=1e-3)

@@ -11,13 +11,14 @@ import torch
 from workbench.collisions.posed_corrective import PosedCorrective
 from workbench.collisions.regressor import (
     Regressor,
+    RegressorTraining,
     TrainRegressorConfig,
     acceleration_loss,
     position_loss,
     run,
     velocity_loss,
 )
-from workbench.collisions.subspace import NetworkConfig, Statistics, Subspace
+from workbench.collisions.subspace import Decoder, NetworkConfig, Statistics, Subspace
 from workbench.collisions.tryon import TryOn, checked_shape, shape_from_words
 from workbench.collisions.tryon_onnx import OnnxNetworks, write_onnx
 from workbench.formats.mesh_sequence import read_dressed_sequence
@@ -166,6 +167,36 @@ def test_training_writes_a_regressor_that_loads_and_continues(trained):
         torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(back.state_dict()[name], tensor, atol=2e-2, rtol=2e-3)
     assert [entry["step"] for entry in back.story["curves"]] == [2, 4]
+
+
+def test_undisturbed_is_what_will_be_said(tryon, motion):
+    given = (motion.rotations[None], motion.translation[None], torch.ones(1, 10))
+    without = tryon.regressor.disturbed(*given, 0.0, 0.0, torch.Generator())
+    torch.testing.assert_close(without, tryon.regressor(*given))
+
+
+def test_disturbance_comes_from_the_generator_alone(tryon, motion):
+    """A run that was ended goes on with the same chance, and takes none from others."""
+    given, regressor = (motion.rotations[None], motion.translation[None], torch.ones(1, 10)), tryon.regressor
+    others = torch.get_rng_state()
+    regressor.train()
+    once, again, other = (
+        regressor.disturbed(*given, 0.2, 0.3, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)
+    )
+    regressor.eval()
+    assert torch.equal(once, again)
+    assert not torch.equal(once, other)
+    assert torch.equal(torch.get_rng_state(), others)
+
+
+def test_latents_count_by_how_far_they_move_the_garment(trained):
+    training = RegressorTraining.of(trained)
+    assert float(training.counts.mean()) == pytest.approx(1)
+    louder = replace(training)
+    decoder = louder.subspace.decoder
+    assert isinstance(decoder, Decoder)
+    decoder.basis[3] *= 5
+    assert float(louder.counts[3] / louder.counts[4]) > 3 * float(training.counts[3] / training.counts[4])
 
 
 def test_a_damaged_regressor_is_refused(tmp_path):
