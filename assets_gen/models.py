@@ -44,9 +44,9 @@ CODE = (
 LOOSE_FROM, DRAWN_UP_FROM, LOOSE_FRAMES = 100, 300, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
-# T-shirt: more clearance than the default, since gap and vertex error had room for it; changed together with what it
-# learns from, not by itself.  Dress: what hangs far off the body is moved for nothing, which costs vertex error.  Both
-# were chosen after figures of test motions and mocap (README).
+# T-shirt: more clearance than the default, since gap and vertex error had room for it with the subspace of then; with
+# the present one the gap is a little large (README).  Dress: what hangs far off the body is moved for nothing, which
+# costs vertex error.  Both were chosen after figures of test motions and mocap (README).
 CORRECTIVE_WEIGHTS = {
     "tshirt": CorrectiveWeights(size=0.002, posed_clearance=6e-3),
     "dress": CorrectiveWeights(size=0.025),

@@ -83,6 +83,23 @@ def test_the_quickest_networks_are_those_that_can_be_had(tryon, monkeypatch):
     assert quickest(fresh).networks is fresh.networks
 
 
+@pytest.mark.parametrize("name", ["tshirt", "dress"])
+def test_what_ships_runs_in_kernels(name):
+    fast = quickest(TryOn.shipped(name))
+    assert isinstance(fast.corrective, KernelCorrective)
+    assert isinstance(fast.networks, KernelNetworks)
+
+
+def test_a_corrective_that_has_to_run_in_torch_says_so(tryon, caplog):
+    patches = Patches.of(tryon.garment.vertices, 12)
+    sight = LimbSight.of(tryon.model.body, tryon.model.fields, patches.centres(tryon.garment.vertices))
+    basis = torch.randn(16, 3 * patches.vertices.numel(), generator=torch.Generator().manual_seed(2))
+    fresh = replace(tryon, corrective=PosedCorrective("tshirt", patches, sight, basis, 64))
+    with caplog.at_level("WARNING"):
+        assert quickest(fresh).corrective is fresh.corrective
+    assert "runs in torch, slowly: the corrective's basis is not exact in float16" in caplog.text
+
+
 @pytest.mark.parametrize("size", [5, 500])  # 500: far beyond its reach
 def test_a_corrective_in_kernels_gives_what_torch_gives(tryon, size):
     chance = torch.Generator().manual_seed(2)

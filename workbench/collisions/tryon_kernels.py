@@ -5,6 +5,7 @@ float16; here they stay so, sums are in float32: torch's numbers from half the b
 """
 
 import contextlib
+import logging
 import math
 from dataclasses import replace
 
@@ -26,7 +27,9 @@ from workbench.collisions.tryon_onnx import OnnxNetworks
 from workbench.extras import MissingExtra
 from workbench.geometry.warp_launch import Recorded, shared_array
 
-ROUNDED = 1e-6  # millimetres: entries below float16's normal numbers are off by so little
+log = logging.getLogger(__name__)
+
+LARGE = 2.0**15  # float16 ends at nearly 2^16
 
 
 class Dense:
@@ -166,9 +169,9 @@ class KernelCorrective:
             given = (shared_array(common, wp.float32), shared_array(shift.detach().numpy(), wp.float32, 2), *vectors)
             values = shared_array(hidden, wp.float32, 2)
             self.rectifying.append(Recorded(add_rectify_and_normalise, count, *given, norm.eps, values))
-        self.last, self.last_own = corrective.last.numpy(), corrective.last_own.numpy()
+        blocks, size, scale = _patch_blocks(corrective)
+        self.last, self.last_own = corrective.last.numpy() / scale, corrective.last_own.numpy() / scale
         self.amounts = np.empty((count, rank), np.float32)
-        blocks, size = _patch_blocks(corrective)
         self.values = np.empty((count, size), np.float32)
         self.points = corrective.patches.vertices.shape[1]
         self.mixing = Recorded(
@@ -206,11 +209,14 @@ class KernelCorrective:
         return torch.from_numpy(offset * np.float32(REACH / max(size, REACH) / MILLI))
 
 
-def _patch_blocks(corrective: PosedCorrective) -> tuple[np.ndarray, int]:
-    """The basis as `mix_patches` reads it, and the values of a patch, filled up to whole blocks."""
+def _patch_blocks(corrective: PosedCorrective) -> tuple[np.ndarray, int, np.float32]:
+    """The basis as `mix_patches` reads it, the values of a patch, filled up to whole blocks, and by what power of two
+    it is larger than it was: the largest that float16 holds, since of small entries it would lose digits."""
     rank, count = len(corrective.basis), len(corrective.patches)
     basis = corrective.basis.detach().unflatten(1, (count, -1))
-    if float((basis.half().float() - basis).abs().max()) > ROUNDED:
+    scale = 2.0 ** math.floor(math.log2(LARGE / max(float(basis.abs().max()), 1 / LARGE)))
+    basis = scale * basis
+    if not torch.equal(basis.half().float(), basis):
         raise ValueError(
             "the corrective's basis is not exact in float16, as one that was loaded from its file is; save and load it "
             "first"
@@ -219,15 +225,17 @@ def _patch_blocks(corrective: PosedCorrective) -> tuple[np.ndarray, int]:
     padded = np.zeros((count, size, rank), np.float16)
     padded[:, : basis.shape[2]] = basis.permute(1, 2, 0).numpy()
     blocks = padded.reshape(count, size // LANES, LANES, rank).transpose(0, 1, 3, 2)
-    return np.ascontiguousarray(blocks).reshape(-1), size
+    return np.ascontiguousarray(blocks).reshape(-1), size, np.float32(scale)
 
 
 def quickest(tryon: TryOn) -> TryOn:
     """The same with the quickest networks there are: these kernels, else onnxruntime, else torch as it is."""
     corrective = tryon.corrective
     if isinstance(corrective, PosedCorrective):
-        with contextlib.suppress(ValueError):
+        try:
             corrective = KernelCorrective(corrective)
+        except ValueError as why:
+            log.warning("the corrective of %s runs in torch, slowly: %s", tryon.garment.name, why)
     for networks in (KernelNetworks, OnnxNetworks):
         with contextlib.suppress(ValueError, MissingExtra):
             return replace(tryon, networks=networks(tryon.regressor, tryon.subspace), corrective=corrective)
