@@ -2,9 +2,9 @@
 
 A choreography shares a bend among the joints of the spine, lets the clavicle follow the arm and keeps feet planted.
 People, and the skeletons that motion capture is put on, share otherwise: here every joint that moves a garment wanders
-by itself about what the motion asks of it; in half of the motions the joints of the spine wander as one, and the lowest
-has the bend of all, as on skeletons that have no other.  Loosened motions of the families hardly bend a hip by 110
-degrees, and those that do push the thigh into the belly; lifted and curled ones do little else.
+by itself about what the motion asks of it; in half of the motions the joints of the spine wander as one, as
+`retargeting` has it where one joint bends it all.  Loosened motions of the families hardly bend a hip by 110 degrees,
+and those that do push the thigh into the belly; lifted and curled ones do little else.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ import torch
 
 from assets_gen.motions import joint_angles, joint_frames, limit_of, wander
 from workbench.motion import Motion
+from workbench.rig_names import SPINE
 
 # Degrees of (flexion, abduction, twist) to either side, ours.  Hips bend to a deep crouch, which no family reaches.
 AMPLITUDES = {
@@ -33,34 +34,32 @@ AMPLITUDES = {
 # Degrees of (flexion, abduction, twist) that a leg drawn up wanders between, and the flexion of its knee
 THIGH, KNEE = ((30, 130), (-15, 60), (-30, 45)), (20, 150)
 CURL = (0, 80)  # degrees that the joints of a curled spine bend forward together
-SPINE = ("LowerBack", "Spine", "Spine1")
 RATE = 0.6  # Hz: the fastest a joint wanders
 
 
 def loosened(motion: Motion, rng: np.random.Generator) -> Motion:
-    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS; in half of all the spine
-    wanders as one, and its bend is gathered in its lowest joint.
+    """The motion with every joint of AMPLITUDES wandering about its way, inside LIMITS; in half of all the joints of
+    the spine wander as one.
 
     Feet slide and may sink: for networks that see theta alone.
     """
     frames, angles = joint_frames(motion.skeleton), joint_angles(motion)
     times = np.arange(len(motion)) / motion.fps
     rotations = motion.rotations.clone()
-    gather = rng.random() < 0.5
+    as_one = rng.random() < 0.5
     of_spine = np.stack([wander(rng, times, -a, a, RATE) for a in AMPLITUDES[SPINE[0]]], axis=-1)
     for joint, usual in angles.items():
         amplitudes = AMPLITUDES.get(joint.removeprefix("Left").removeprefix("Right"))
         if amplitudes is None:
             continue
         added = np.stack([wander(rng, times, -a, a, RATE) for a in amplitudes], axis=-1)
-        if gather and joint in SPINE:
+        if as_one and joint in SPINE:
             added = of_spine
         limit = limit_of(joint)
         allowed = torch.tensor([limit.flexion, limit.abduction, limit.twist], dtype=torch.float64)
         meant = torch.clamp(usual + torch.from_numpy(added), allowed[:, 0], allowed[:, 1])
         rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
-    loose = replace(motion, rotations=rotations, name=f"{motion.name}_loose")
-    return gathered(loose) if gather else loose
+    return replace(motion, rotations=rotations, name=f"{motion.name}_loose")
 
 
 def lifted(motion: Motion, rng: np.random.Generator) -> Motion:
@@ -79,8 +78,7 @@ def curled(motion: Motion, rng: np.random.Generator) -> Motion:
     for joint in SPINE:
         meant = torch.stack([bend, *angles[joint].unbind(1)[1:]], dim=1)
         rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
-    whole = replace(loose, rotations=rotations, name=f"{motion.name}_curled")
-    return gathered(whole) if rng.random() < 0.5 else whole
+    return replace(loose, rotations=rotations, name=f"{motion.name}_curled")
 
 
 def _drawn_up(motion: Motion, sides: Sequence[str], rng: np.random.Generator) -> Motion:
@@ -93,14 +91,4 @@ def _drawn_up(motion: Motion, sides: Sequence[str], rng: np.random.Generator) ->
         shank[:, 0] = torch.from_numpy(wander(rng, times, *KNEE, RATE))
         for joint, meant in ((side + "UpLeg", torch.from_numpy(thigh)), (side + "Leg", shank)):
             rotations[:, motion.skeleton.index(joint)] = frames[joint].rotation(meant).float()
-    return replace(motion, rotations=rotations)
-
-
-def gathered(motion: Motion) -> Motion:
-    """The same with the whole bend of the spine in its lowest joint."""
-    rotations = motion.rotations.clone()
-    lowest, *others = (motion.skeleton.index(joint) for joint in SPINE)
-    for other in others:  # from the hips up, as they are chained
-        rotations[:, lowest] = rotations[:, lowest] @ rotations[:, other]
-        rotations[:, other] = torch.eye(3)
     return replace(motion, rotations=rotations)

@@ -44,11 +44,11 @@ CODE = (
 LOOSE_FROM, DRAWN_UP_FROM, LOOSE_FRAMES = 100, 300, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
-# T-shirt: more clearance than the default, since gap and vertex error had room for it with the subspace of then; with
-# the present one the gap is a little large (README).  Dress: what hangs far off the body is moved for nothing, which
-# costs vertex error.  Both were chosen after figures of test motions and mocap (README).
+# T-shirt: more clearance than the default, as gap and vertex error have room for it.  Dress: what hangs far off the
+# body is moved for nothing, which costs vertex error.  Both were chosen after figures of test motions and mocap
+# (README).
 CORRECTIVE_WEIGHTS = {
-    "tshirt": CorrectiveWeights(size=0.002, posed_clearance=6e-3),
+    "tshirt": CorrectiveWeights(size=0.002, posed_clearance=5e-3),
     "dress": CorrectiveWeights(size=0.025),
 }
 # Tab. 1: what each row leaves out of Eq. 13
@@ -80,8 +80,8 @@ class ModelsConfig:
     """the same of the family that covers pose space most widely"""
     loose: int = 80
     """loosened motions of each training family, not cleared, that only the corrective sees"""
-    drawn_up: int = 60
-    """the same with one knee or both drawn up, and as many with both drawn up to a bent trunk"""
+    drawn_up: int = 18
+    """the same with one knee or both drawn up, and as many with both drawn up to a bent trunk; cleared"""
     stages: tuple[str, ...] = STAGES
     """what to train; of the others the networks in `out` are taken"""
 

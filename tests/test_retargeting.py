@@ -175,6 +175,18 @@ def test_the_chest_carries_the_arms_when_the_source_has_fewer_vertebrae(body):
     torch.testing.assert_close(joints(retargeted)[1][:, body.skeleton.index("Spine1")], chest, rtol=0, atol=1e-5)
 
 
+def test_a_spine_of_one_joint_is_shared_by_all_of_ours_and_the_chest_stays_where_it_was(body):
+    motion = moving(rig(without=("Spine", "Spine1")))
+    retargeted = retarget(motion, body.skeleton)
+    bend = motion.rotations[:, motion.skeleton.index("LowerBack")]
+    local = [retargeted.rotations[:, body.skeleton.index(role)] for role in ("LowerBack", "Spine", "Spine1")]
+    for one in local[1:]:
+        torch.testing.assert_close(one, local[0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(local[0] @ local[1] @ local[2], bend, rtol=0, atol=1e-5)
+    for one, whole in zip(rotation_angle(local[0]), rotation_angle(bend), strict=True):
+        assert float(one) == pytest.approx(float(whole) / 3, abs=1e-4)
+
+
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("units", [1.0, 100.0, 39.37 * 0.45])
 def test_units_and_up_axis_of_the_file_do_not_matter(up, units, source, body, tmp_path):

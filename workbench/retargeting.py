@@ -5,7 +5,8 @@ For a joint of the target that has a counterpart in the source, with global rota
 C takes the source's axes to ours (z up, facing -y) and A takes the target's rest pose to the source's: the smallest
 rotation between the rest directions of a limb's bone, turned about it so that elbows and knees fold about one axis.
 The spine, neck and clavicles are not aligned (A = I): their bones run differently in every rig, their flesh does not.
-A joint without counterpart keeps its rest rotation relative to its parent.
+A joint without counterpart keeps its rest rotation relative to its parent.  But where one joint of the source bends its
+whole spine, all of the target's share that bend: in one joint it folds the belly into itself.
 """
 
 import logging
@@ -21,9 +22,9 @@ from torch import Tensor
 from workbench.body.model import Body
 from workbench.body.skeleton import Skeleton
 from workbench.body.skinning import forward_kinematics
-from workbench.geometry.rotations import axis_angle_to_matrix, rotation_angle, smallest_rotation
+from workbench.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rotation_angle, smallest_rotation
 from workbench.motion import Motion
-from workbench.rig_names import SIDES, roles_of
+from workbench.rig_names import SIDES, SPINE, roles_of
 
 log = logging.getLogger(__name__)
 
@@ -377,9 +378,12 @@ def retarget(
     identity = torch.eye(3, dtype=torch.float64)
     role_of = {j: role for role, j in target_roles.items()}
     turned: list[Tensor] = []
+    spine = _spread_spine(world, source_roles, target_roles)
     for j, parent in enumerate(target.parents):
         role = role_of.get(j)
-        if role in source_roles:
+        if role in spine:
+            turned.append(spine[role])
+        elif role in source_roles:
             turned.append(world[:, source_roles[role]] @ A.get(role, identity))
         else:
             turned.append(turned[parent] if parent >= 0 else identity.repeat(len(world), 1, 1))
@@ -404,6 +408,22 @@ def retarget(
         skeleton=skeleton,
         name=motion.name,
     )
+
+
+def _spread_spine(
+    world: Float[Tensor, "T J 3 3"], source_roles: Mapping[str, int], target_roles: Mapping[str, int]
+) -> dict[str, Float[Tensor, "T 3 3"]]:
+    """Role -> global rotations, of the target's spine where one joint of the source bends all of its own; else nothing.
+
+    The bend from the pelvis to the chest is shared evenly, about one axis.
+    """
+    own = [source_roles[role] for role in SPINE if role in source_roles]
+    wanted = [role for role in SPINE if role in target_roles]
+    if len(own) != 1:
+        return {}
+    pelvis, chest = world[:, source_roles["Hips"]], world[:, own[0]]
+    bend = matrix_to_axis_angle(pelvis.mT @ chest)
+    return {role: pelvis @ axis_angle_to_matrix(k / len(wanted) * bend) for k, role in enumerate(wanted, start=1)}
 
 
 def _turn_up(axis: Axis) -> Float[Tensor, "3 3"]:

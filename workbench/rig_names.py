@@ -10,6 +10,7 @@ from types import MappingProxyType
 from workbench.body.skeleton import Skeleton
 
 SIDES = ("Left", "Right")
+SPINE = ("LowerBack", "Spine", "Spine1")  # from the pelvis to the chest
 LIMBS = ("UpLeg", "Leg", "Foot", "Arm", "ForeArm", "Hand")
 REQUIRED_ROLES = ("Hips", *(side + limb for side in SIDES for limb in LIMBS))
 

@@ -32,17 +32,17 @@ def test_the_template_at_rest_is_outside_and_what_is_pushed_in_is_inside(body, d
 
 
 def test_it_agrees_with_the_exact_inside_test(body, distance):
-    """Everywhere at rest; in a pose that overlaps itself almost everywhere (see SURELY_OUTSIDE)."""
+    """At rest, and in a pose that overlaps itself."""
     rotations, betas = rest(body)
     crossed = rotations.clone()
     crossed[0, body.joint_names.index("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.7, 0.0]))
-    for pose, allowed in ((rotations, 0.001), (crossed, 0.01)):
+    for pose in (rotations, crossed):
         bodies = body.vertices(pose, betas)
         points = bodies[:, ::7] + 0.01 * torch.randn(bodies[:, ::7].shape, generator=torch.Generator().manual_seed(0))
         found = distance.between(points, bodies)
         truth = penetration(bodies, body.faces, points).inside & (found.abs() < distance.reach)
         wrong = float(((found < 0) != truth).float().mean())
-        assert wrong <= allowed, f"{100 * wrong:.2f} % of the signs are wrong"
+        assert wrong <= 0.001, f"{100 * wrong:.2f} % of the signs are wrong"
 
 
 def test_a_step_up_the_gradient_frees_vertices(body, distance):
@@ -53,6 +53,24 @@ def test_a_step_up_the_gradient_frees_vertices(body, distance):
     inside = before < 0
     assert int(inside.sum()) > 100
     assert float((after < 0).float().sum()) < 0.8 * float(inside.sum())
+
+
+def test_where_the_body_overlaps_itself_the_way_out_ends_on_skin_that_is_seen(body, distance):
+    """A thigh in the belly: its skin is no way out for what is in both."""
+    rotations, betas = rest(body)
+    rotations[0, body.joint_names.index("LeftUpLeg")] = axis_angle_to_matrix(torch.tensor([-2.3, 0.0, 0.0]))
+    bodies = body.vertices(rotations, betas)
+    normals = vertex_normals(bodies, body.faces)
+    hidden = penetration(bodies, body.faces, bodies + 0.002 * normals).inside[0]
+    points = (bodies - 0.005 * normals)[:, hidden].requires_grad_()
+    assert points.shape[1] > 100
+    found = distance.between(points, bodies)
+    assert float((found < 0).float().mean()) > 0.9
+    (away,) = torch.autograd.grad(found.sum(), points)
+    points, found = points.detach(), found.detach()
+    out = points - (found - 0.001).clamp(max=0.0)[..., None] * away
+    assert float(penetration(bodies, body.faces, out).inside.float().mean()) < 0.1
+    assert float((out - points).norm(dim=-1).max()) < distance.overlap_reach + 0.002
 
 
 def test_far_vertices_have_no_gradient(body, distance):

@@ -48,6 +48,7 @@ MILLI = 1e3
 FIRST_GAIN = 4.0  # how far the principal directions of the needed corrections reach at amounts of 1
 FIRST_OWN = 0.5  # standard deviation of the biases by which patches differ at first
 ROOM = 0.016  # metres that uncleared poses must leave between limbs where the garment hangs
+FOLDED = 0.02  # share of the vertices where a body that is folded up may overlap itself, once it is cleared
 # Metres, root mean square over the garment, that an offset may have: a guard.  21 clips of mocap, errors of capture and
 # getting up from the floor among them, ask for up to 109 mm of the T-shirt; walking for 20
 REACH = 0.1
@@ -88,7 +89,7 @@ class TrainCorrectiveConfig:
     motions: tuple[Path, ...] = ()
     # The same, but not cleared: those of their poses are learned from that leave cloth room.
     uncleared: tuple[Path, ...] = ()
-    # Uncleared ones of bodies that are folded up: there skin is on skin, and it is enough that it is not in it.
+    # The same of bodies that are folded up, cleared for one shape each: there skin stays on skin, and in it.
     close: tuple[Path, ...] = ()
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
@@ -279,11 +280,12 @@ class CorrectiveTraining:
         kept = config.out / "work" / "cleared"
         wearer = Wearer(body, self.regressor, config.shapes_a_motion, config.every, seed, kept)
         worn = with_room(wearer(motions), self.garments, body)
-        if split == "train":
-            for folders, room in ((config.uncleared, ROOM), (config.close, 0.0)):
-                if folders:
-                    more = wearer.uncleared(_motions_in(folders, body))
-                    worn = WornPoses.joined([worn, with_room(more, self.garments, body, room)])
+        if split == "train" and config.uncleared:
+            more = wearer.uncleared(_motions_in(config.uncleared, body))
+            worn = WornPoses.joined([worn, with_room(more, self.garments, body, ROOM)])
+        if split == "train" and config.close:
+            more = wearer(_motions_in(config.close, body), shapes=1)
+            worn = WornPoses.joined([worn, with_room(more, self.garments, body, most_overlap=FOLDED)])
         log.info("%d poses of the %s motions", len(worn), split)
         return worn
 

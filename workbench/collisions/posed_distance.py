@@ -4,7 +4,8 @@ Eq. 16 sees only the constant canonical body.  Where limbs close, Eq. 7 folds sp
 touches nothing can end inside the posed body (facts.md 9).  The gradient of this distance is the way out.
 
 It is differentiable; the fields at X are held fixed in the gradient (as in fixed-point unskinning, which shows that
-it is good enough).
+it is good enough).  Where the body overlaps itself, skin that lies inside of it is no way out: there the skin that can
+be seen counts alone.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from workbench.geometry.winding import InsideTest
 # Cosine between the way to a point and the surface normal there.  Above it no winding number is asked: a third of the
 # time (15 against 45 ms a frame), 0.00 to 0.10 % of the signs wrong on three test sequences.  Evaluation is exact.
 SURELY_OUTSIDE = 0.5
+# Of the skin near the cloth, one place in so many is asked whether it lies inside the body, a millimetre off
+ASKED, LIFT = 8, 1e-3
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class PosedDistance:
 
     model: GarmentModel
     reach: float = 0.04  # metres: deeper than this the closest surface is not the way out
+    overlap_reach: float = 0.08  # the same where the body overlaps itself, to skin that can be seen
 
     @cached_property
     def _closest(self) -> ClosestPoint:
@@ -60,14 +64,38 @@ class PosedDistance:
         normals = torch.stack([vertex_normals(surface, faces) for surface in bodies]).numpy()
         for frame, (points, surface) in enumerate(zip(posed.detach().numpy(), bodies.numpy(), strict=True)):
             self._closest.refit(surface)
-            hit = self._closest.query(points)
-            near = np.flatnonzero(hit.distance < self.reach)
-            away = (points[near] - hit.point[near]) / np.maximum(hit.distance[near, None], 1e-7)
-            outward = hit.interpolate(normals[frame], faces.numpy())[near]
-            doubtful = near[(away * outward).sum(-1) < SURELY_OUTSIDE]
             self._inside.refit(surface)
+            hit = self._closest.query(points)
+            outward = hit.interpolate(normals[frame], faces.numpy())
+            near = np.flatnonzero(hit.distance < self.reach)
+            asked = near[::ASKED]
+            skin, distance = hit.point, hit.distance
+            if self._inside(skin[asked] + LIFT * outward[asked]).any():
+                inner = np.flatnonzero(self._inside(points))
+                skin[inner], distance[inner] = self._seen_skin(points[inner], surface, normals[frame])
+                near = np.union1d(near, inner)[distance[np.union1d(near, inner)] < self.overlap_reach]
+            else:
+                cosine = ((points - skin)[near] * outward[near]).sum(-1) / np.maximum(distance[near], 1e-7)
+                doubtful = near[cosine < SURELY_OUTSIDE]
+                inner = doubtful[self._inside(points[doubtful])]
             sign = np.ones(len(points), np.float32)
-            sign[doubtful[self._inside(points[doubtful])]] = -1.0
-            values[frame, near] = torch.from_numpy(sign[near] * hit.distance[near])
+            sign[inner] = -1.0
+            away = (points - skin)[near] / np.maximum(distance[near, None], 1e-7)
+            values[frame, near] = torch.from_numpy(sign[near] * distance[near])
             directions[frame, near] = torch.from_numpy(sign[near, None] * away)
         return values + (directions * (posed - posed.detach())).sum(-1)
+
+    def _seen_skin(
+        self, points: Float[np.ndarray, "N 3"], surface: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
+        """The closest skin that is not itself inside the body, and how far it is; where none is in reach, far off."""
+        low, high = (f(points, axis=0) for f in (np.min, np.max)) if len(points) else (np.zeros(3), np.zeros(3))
+        about = ((surface > low - self.overlap_reach) & (surface < high + self.overlap_reach)).all(axis=1)
+        seen = np.zeros(len(surface), bool)
+        seen[about] = ~self._inside((surface + LIFT * normals)[about])
+        faces = self.model.body.faces.numpy()
+        kept = faces[seen[faces].all(axis=1)]
+        if not len(points) or not len(kept):
+            return points, np.full(len(points), np.inf, np.float32)
+        hit = ClosestPoint(surface, kept).query(points)
+        return hit.point, hit.distance

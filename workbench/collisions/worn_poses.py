@@ -24,7 +24,7 @@ from workbench.motion import Motion
 from workbench.store import Store, code_version
 
 SHAPE_CUT = 2.5  # standard deviations: random shapes are cut there
-MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself: beyond, nothing can be learned
+MOST_OVERLAP = 0.002  # share of a garment's vertices where the body may overlap itself
 LOOKED_AT = 4  # for which one vertex in so many is looked at
 
 
@@ -88,9 +88,9 @@ class Wearer:
     seed: int
     kept: Path  # the folder of cleared motions
 
-    def __call__(self, motions: Sequence[Motion]) -> WornPoses:
-        """Every motion on its shapes, cleared for each; what was cleared before is read."""
-        worn = [(motion, betas) for motion in motions for betas in self.shapes_of(motion)]
+    def __call__(self, motions: Sequence[Motion], shapes: int | None = None) -> WornPoses:
+        """Every motion on its shapes (or on so many of them), cleared for each; what was cleared before is read."""
+        worn = [(motion, betas) for motion in motions for betas in self.shapes_of(motion)[:shapes]]
         with ThreadPoolExecutor(2) as pool:
             made = pool.map(lambda pair: self.worn(*pair), worn)
             return WornPoses.joined(list(tqdm(made, total=len(worn), desc="clear for random shapes", mininterval=5.0)))
@@ -118,9 +118,14 @@ class Wearer:
 
 @torch.no_grad()
 def with_room(
-    worn: WornPoses, garments: Callable[[WornPoses], Float[Tensor, "B N 3"]], body: Body, gap: float = 0.0
+    worn: WornPoses,
+    garments: Callable[[WornPoses], Float[Tensor, "B N 3"]],
+    body: Body,
+    gap: float = 0.0,
+    most_overlap: float = MOST_OVERLAP,
 ) -> WornPoses:
-    """The poses in which the body keeps `gap` metres from itself where the garment hangs, and does not overlap."""
+    """The poses in which the body keeps `gap` metres from itself where the garment hangs, and does not overlap: at no
+    more than a share of the vertices."""
     free = []
     for part in torch.arange(len(worn)).split(64):
         some = worn[part]
@@ -128,7 +133,7 @@ def with_room(
         if gap:
             bodies = bodies + gap / 2 * vertex_normals(bodies, body.faces)
         overlap = penetration(bodies, body.faces, garments(some)[:, ::LOOKED_AT]).overlap.float().mean(dim=1)
-        free.append(some[torch.nonzero(overlap <= MOST_OVERLAP)[:, 0]])
+        free.append(some[torch.nonzero(overlap <= most_overlap)[:, 0]])
     return WornPoses.joined(free)
 
 
