@@ -37,9 +37,9 @@ def test_collisions_are_counted_on_a_folder_of_motions(body, tmp_path):
 def test_the_fast_path_is_faster_and_its_parts_sum_to_the_frame():
     config = RuntimeEvaluation(("tshirt",), frames=6, reference_frames=2, rounds=2, compared_frames=2)
     table = {row.metric: row for row in runtime_rows(config)}
-    one = table["tshirt: posed garment, table against the definition of Eq. 4-6, mean"]
-    assert 0 < one.value < 0.5
-    other = table["tshirt: posed garment, table against field networks, mean"]
+    one = table["tshirt: posed garment, table against the definition of Eq. 4-6, mean of the worst frame"]
+    assert 0 < table["tshirt: posed garment, table against the definition of Eq. 4-6, mean"].value <= one.value < 0.5
+    other = table["tshirt: posed garment, table against field networks, mean of the worst frame"]
     assert 0 < other.value < 8  # the bound of 0.5 mm is not reached: the field network of B~s errs by more (README)
     assert next(row for name, row in table.items() if "faster than the reference" in name).value > 5
     frame = next(row.value for name, row in table.items() if "one thread, median" in name)

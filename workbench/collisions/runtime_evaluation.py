@@ -127,9 +127,9 @@ def _difference_rows(name: str, tryon: TryOn, motion: Motion, config: RuntimeEva
             apart.setdefault(pair, []).append(MILLI * float((one - two).norm(dim=-1).mean()))
     rows: list[Row] = []
     for pair, values in apart.items():
-        label, mean = f"{name}: posed garment, {pair}, mean", sum(values) / len(values)
-        rows.append(at_most(label, mean, "mm", 0.5) if pair.startswith("table") else told(label, mean, "mm"))
-        rows.append(told(f"{label} of the worst frame", max(values), "mm"))
+        label = f"{name}: posed garment, {pair}, mean"
+        for what, value in ((label, sum(values) / len(values)), (f"{label} of the worst frame", max(values))):
+            rows.append(at_most(what, value, "mm", 0.5) if pair.startswith("table") else told(what, value, "mm"))
     return rows
 
 
