@@ -24,7 +24,8 @@ from pathlib import Path
 import torch
 from torch import distributed
 
-atexit.register(lambda: print("together" if distributed.is_initialized() else "left"))  # runs last
+# runs last; a word and its line end in one piece, or unbuffered processes write "leftleft"
+atexit.register(lambda: print("together\\n" if distributed.is_initialized() else "left\\n", end=""))
 
 from workbench.learning.fit import FitConfig, fit
 from workbench.learning.parallel import processes
