@@ -46,7 +46,8 @@ FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
 # T-shirt: more clearance than the default, as gap and vertex error have room for it.  Dress: what hangs far off the
 # body is moved for nothing, which costs vertex error.  Both were chosen after figures of test motions and mocap
-# (README).
+# (README).  The T-shirt's corrective that ships was not made from nothing: it continues its predecessor with 5.5 mm
+# (`workbench train corrective --start`, see manifest.json).
 CORRECTIVE_WEIGHTS = {
     "tshirt": CorrectiveWeights(size=0.002, posed_clearance=5e-3),
     "dress": CorrectiveWeights(size=0.025),

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from workbench.collisions.garment_model import GarmentModel
@@ -57,45 +57,54 @@ class PosedDistance:
         return self.between(local.posed(X), bodies)
 
     def between(self, posed: Float[Tensor, "B N 3"], bodies: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N"]:
-        """Signed distance to each body, differentiable in the points; beyond `reach` it says `reach`, constant."""
+        """Signed distance to each body, differentiable in the points; what is out of reach gets `reach`, constant."""
         values = torch.full(posed.shape[:-1], self.reach)
         directions = torch.zeros_like(posed)
         faces = self.model.body.faces
         normals = torch.stack([vertex_normals(surface, faces) for surface in bodies]).numpy()
         for frame, (points, surface) in enumerate(zip(posed.detach().numpy(), bodies.numpy(), strict=True)):
-            self._closest.refit(surface)
-            self._inside.refit(surface)
-            hit = self._closest.query(points)
-            outward = hit.interpolate(normals[frame], faces.numpy())
-            near = np.flatnonzero(hit.distance < self.reach)
-            asked = near[::ASKED]
-            skin, distance = hit.point, hit.distance
-            if self._inside(skin[asked] + LIFT * outward[asked]).any():
-                inner = np.flatnonzero(self._inside(points))
-                skin[inner], distance[inner] = self._seen_skin(points[inner], surface, normals[frame])
-                near = np.union1d(near, inner)[distance[np.union1d(near, inner)] < self.overlap_reach]
-            else:
-                cosine = ((points - skin)[near] * outward[near]).sum(-1) / np.maximum(distance[near], 1e-7)
-                doubtful = near[cosine < SURELY_OUTSIDE]
-                inner = doubtful[self._inside(points[doubtful])]
-            sign = np.ones(len(points), np.float32)
-            sign[inner] = -1.0
-            away = (points - skin)[near] / np.maximum(distance[near, None], 1e-7)
-            values[frame, near] = torch.from_numpy(sign[near] * distance[near])
-            directions[frame, near] = torch.from_numpy(sign[near, None] * away)
+            near, signed, away = self._of_frame(points, surface, normals[frame])
+            values[frame, near] = torch.from_numpy(signed)
+            directions[frame, near] = torch.from_numpy(away)
         return values + (directions * (posed - posed.detach())).sum(-1)
+
+    def _of_frame(
+        self, points: Float[np.ndarray, "N 3"], surface: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]
+    ) -> tuple[Int[np.ndarray, "M"], Float[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
+        """The points in reach of the skin, their signed distances, and where these grow."""
+        self._closest.refit(surface)
+        self._inside.refit(surface)
+        hit = self._closest.query(points)
+        skin, distance, outward = hit.point, hit.distance, hit.interpolate(normals, self.model.body.faces.numpy())
+        near = np.flatnonzero(distance < self.reach)
+        asked = near[::ASKED]
+        if self._inside(skin[asked] + LIFT * outward[asked]).any():  # the body overlaps itself
+            inner = np.flatnonzero(self._inside(points))
+            skin[inner], distance[inner] = self._seen_skin(points[inner], surface, normals)
+            near = np.union1d(near, inner)
+            near = near[distance[near] < self.overlap_reach]
+        else:
+            cosine = ((points - skin)[near] * outward[near]).sum(-1) / np.maximum(distance[near], 1e-7)
+            doubtful = near[cosine < SURELY_OUTSIDE]
+            inner = doubtful[self._inside(points[doubtful])]
+        sign = np.ones(len(points), np.float32)
+        sign[inner] = -1.0
+        away = (points - skin)[near] / np.maximum(distance[near, None], 1e-7)
+        return near, sign[near] * distance[near], sign[near, None] * away
 
     def _seen_skin(
         self, points: Float[np.ndarray, "N 3"], surface: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]
     ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
         """The closest skin that is not itself inside the body, and how far it is; where none is in reach, far off."""
-        low, high = (f(points, axis=0) for f in (np.min, np.max)) if len(points) else (np.zeros(3), np.zeros(3))
-        about = ((surface > low - self.overlap_reach) & (surface < high + self.overlap_reach)).all(axis=1)
+        if not len(points):
+            return points, np.zeros(0, np.float32)
+        low, high = points.min(axis=0) - self.overlap_reach, points.max(axis=0) + self.overlap_reach
+        about = ((surface > low) & (surface < high)).all(axis=1)
         seen = np.zeros(len(surface), bool)
         seen[about] = ~self._inside((surface + LIFT * normals)[about])
         faces = self.model.body.faces.numpy()
         kept = faces[seen[faces].all(axis=1)]
-        if not len(points) or not len(kept):
+        if not len(kept):
             return points, np.full(len(points), np.inf, np.float32)
         hit = ClosestPoint(surface, kept).query(points)
         return hit.point, hit.distance
