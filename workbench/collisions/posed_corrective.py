@@ -174,7 +174,9 @@ class PosedCorrective(nn.Module):
         hidden = self.sight(rotations, betas) @ first + (of_all @ common)[..., None, :] + self.first_own
         hidden = self.first_norm(torch.relu(hidden)) @ self.second + self.second_own
         hidden = self.second_norm(torch.relu(hidden))
-        return self.mixed((hidden[..., None, :] @ self.last)[..., 0, :] + self.last_own) / MILLI
+        of_patches = hidden.reshape(-1, *hidden.shape[-2:]).transpose(0, 1)  # (P,B,W): `last` is not copied for each B
+        amounts = (of_patches @ self.last).transpose(0, 1) + self.last_own
+        return self.mixed(amounts.reshape(*hidden.shape[:-1], -1)) / MILLI
 
     def mixed(self, amounts: Float[Tensor, "*B P R"]) -> Float[Tensor, "*B N 3"]:
         """Offsets of amounts, millimetres."""
