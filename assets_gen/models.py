@@ -45,12 +45,12 @@ LOOSE_FROM, DRAWN_UP_FROM, LOOSE_FRAMES = 100, 300, 60
 FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
 # T-shirt: more clearance than the default, as gap and vertex error have room for it.  Dress: what hangs far off the
-# body is moved for nothing, which costs vertex error.  Both were chosen after figures of test motions and mocap
-# (README).  The T-shirt's corrective that ships was not made from nothing: it continues its predecessor with 5.5 mm
-# (`workbench train corrective --start`, see manifest.json).
-CORRECTIVE_WEIGHTS = {
-    "tshirt": CorrectiveWeights(size=0.002, posed_clearance=5e-3),
-    "dress": CorrectiveWeights(size=0.025),
+# body is moved for nothing, which costs vertex error; its skirt is wide, so that patches are smaller.  Both were chosen
+# after figures of test motions and mocap (README).  The dress's corrective that ships continues what comes of this with
+# other weights (`workbench train corrective --start`, see manifest.json).
+CORRECTIVES: dict[str, dict[str, Any]] = {
+    "tshirt": {"weights": CorrectiveWeights(size=0.002, posed_clearance=5.5e-3)},
+    "dress": {"weights": CorrectiveWeights(size=0.025), "patches": 96, "rank": 20},
 }
 # Tab. 1: what each row leaves out of Eq. 13
 ABLATIONS = {
@@ -106,11 +106,10 @@ def run(config: ModelsConfig) -> None:
         motions = (further_motions(config),) if config.further or config.further_lively else ()
         uncleared = (loose_motions(config),) if config.loose else ()
         close = drawn_up_motions(config) if config.drawn_up else ()
-        weights = config.corrective.weights
-        if weights == CorrectiveWeights():
-            weights = CORRECTIVE_WEIGHTS.get(config.garment, weights)
+        asked, usual = config.corrective, TrainCorrectiveConfig()
+        own = {k: v for k, v in CORRECTIVES.get(config.garment, {}).items() if getattr(asked, k) == getattr(usual, k)}
         seen = {"motions": motions, "uncleared": uncleared, "close": close}
-        learned = replace(config.corrective, weights=weights, **seen, **here)
+        learned = replace(asked, **own, **seen, **here)
         stories["corrective"] = train_corrective(learned).story
     if config.data is not None:
         return

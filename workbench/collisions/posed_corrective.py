@@ -94,17 +94,17 @@ class TrainCorrectiveConfig:
     # A corrective to begin with, for other weights or motions than it was trained with; rank and width are its own.
     start: Path | None = None
     patches: int = 64  # of the garment, overlapping
-    rank: int = 16  # offsets that are mixed in each
-    width: int = 128  # of the layers that say how much of each
+    rank: int = 24  # offsets that are mixed in each
+    width: int = 256  # of the layers that say how much of each
     weights: CorrectiveWeights = CorrectiveWeights()  # of the terms of the loss
     jitter: Jitter = Jitter()  # what is added to poses, shapes and latents, at every look
     shapes_a_motion: int = 2  # random shapes that wear each training motion
     every: int = 3  # frames of it: one in so many is learned from
     first_frames: int = 240  # whose needed corrections give the first basis
     round_poses: int = 1000  # jittered poses whose contacts are looked at ...
-    round_steps: int = 400  # ... and learned from for so many steps
+    round_steps: int = 600  # ... and learned from for so many steps
     batch: int = 32  # poses a step
-    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=16_000, learning_rate=2e-3, clip_norm=50.0))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=20_000, learning_rate=2e-3, clip_norm=50.0))
     seed: int = 0
 
 
@@ -121,7 +121,7 @@ class PosedCorrective(nn.Module):
         patches: Patches,
         sight: LimbSight,
         basis: Float[Tensor, "R P3n"],
-        width: int = 128,
+        width: int = 256,
         generator: torch.Generator | None = None,
     ):
         """basis: of each patch, amounts -> flattened offsets, millimetres; beside each other."""
