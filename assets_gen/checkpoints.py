@@ -32,7 +32,8 @@ LICENCE = "CC0-1.0"  # derived from the default body, whose data are CC0
 class CheckpointsConfig:
     """Tabulate the fields and the SDF of the default body and train the paper's four networks (about 90 minutes on two
     cores; a run that is killed continues its training).  `--no-grids --training.networks sdf` makes the SDF's network
-    alone."""
+    alone.  Those of W~, B~s and B~p that ship learned on from what this makes (`workbench train fields --start`,
+    manifest.json)."""
 
     out: Path = Path("workbench/assets/fields")
     work: Path = Path("out/checkpoints")  # where training keeps its state
