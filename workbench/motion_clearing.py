@@ -73,8 +73,8 @@ class ClearingConfig:
     leg_near: float = 0.03  # the same between the legs (crotch)
     leg_far: float = 0.08
     # The same between a leg and the torso, but of the sample to the very skin that it meets: every deep bend folds skin
-    # on skin, and who sits upright is to keep sitting (a hip bent by 92 degrees gives way by 6 to 10).  0.10 and 0.18 ask
-    # 16 to 23 there and leave 0.106 instead of 0.128 % of a T-shirt inside on 17 clips.  Asked of the sample to the
+    # on skin, and who sits upright is to keep sitting (a hip bent by 92 degrees gives way by 6 to 10).  0.10 and 0.18
+    # ask 16 to 23 there and leave 0.106 instead of 0.128 % of a T-shirt inside on 17 clips.  Asked of the sample to the
     # torso's nearest point, as it was before, thighs lay up to 45 mm in bellies: 0.213 %
     groin_near: float = 0.18
     groin_far: float = 0.26
