@@ -46,8 +46,9 @@ FURTHER_FROM = 24  # index of the first motion of a family that no data set has
 STAGES = ("subspace", "regressor", "corrective")
 # T-shirt: more clearance than the default, as gap and vertex error have room for it.  Dress: what hangs far off the
 # body is moved for nothing, which costs vertex error; its skirt is wide, so that patches are smaller.  Both were chosen
-# after figures of test motions and mocap (README).  The dress's corrective that ships lies between what comes of this
-# and its continuation with other weights (`workbench train corrective --start`, see manifest.json).
+# after figures of test motions and mocap (README).  What ships was made like this from motions whose thighs clearing
+# left in bellies, and continued with `workbench train corrective --start` on the same motions cleared as they are now
+# (README, manifest.json); from nothing on those it was not trained.
 CORRECTIVES: dict[str, dict[str, Any]] = {
     "tshirt": {"weights": CorrectiveWeights(size=0.002, posed_clearance=5.5e-3)},
     "dress": {"weights": CorrectiveWeights(size=0.025), "patches": 96, "rank": 20},
