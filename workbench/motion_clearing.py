@@ -467,10 +467,11 @@ class Stage:
                 hit.frame[mine], hit.query[mine], hit.normal[mine], limb.by_root[which], limb.by_hinge[which]
             )
         of_right = hit.sample >= first
-        owed = np.where(head, owed_head[hit.sample], owed_trunk[hit.sample])
         if self.limbs[0].hinge is None:
             own = np.concatenate([limb.samples.rest.numpy() for limb in self.working])[hit.sample]
             owed = owed_to_skin(own, core, hit.vertices, hit.share, self.config)
+        else:
+            owed = np.where(head, owed_head[hit.sample], owed_trunk[hit.sample])
         return Rows(
             limb=of_right.astype(int),
             sample=np.concatenate(self.chosen)[hit.sample],
@@ -820,17 +821,19 @@ def _limbs(body: Body, betas: Float[Tensor, "K"], config: ClearingConfig) -> tup
         assert root is not None
         own = np.flatnonzero(belongs[name].numpy())
         points = rest[own].numpy()
-        other_part = parts[other]
-        apart, off = (
-            ClosestPoint(p.with_centres(rest.numpy()), p.faces).query(points).distance for p in (other_part, still)
-        )
+
+        def off(part: Part) -> Float[np.ndarray, "N"]:
+            return ClosestPoint(part.with_centres(rest.numpy()), part.faces).query(points).distance
+
+        to_other_part = off(parts[other])
         if hinge is None:
             to_trunk = to_head = np.full(len(own), config.contact)  # at most, see `owed_to_skin`
-            to_other = _owed(apart, config.contact, config.leg_near, config.leg_far)
+            to_other = _owed(to_other_part, config.contact, config.leg_near, config.leg_far)
         else:
-            to_trunk = _owed(off, config.clearance, config.near, config.far)
-            to_head = _owed(off, config.contact, config.near, config.far)
-            to_other = _owed(apart, config.contact, config.near, config.far)
+            to_core = off(still)
+            to_trunk = _owed(to_core, config.clearance, config.near, config.far)
+            to_head = _owed(to_core, config.contact, config.near, config.far)
+            to_other = _owed(to_other_part, config.contact, config.near, config.far)
         cloud = points
         if hinge is not None:
             end = skeleton.children(hinge)[0]
