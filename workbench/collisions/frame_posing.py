@@ -1,8 +1,9 @@
 """Eq. 7-8, frame by frame, for one shape.  canonical X (N,3), theta (J,3,3), H (3) -> posed garment (N,3).
 
 `TablePoser` computes what `GarmentModel` computes with `GridFields`, in a tenth of the time: a node's B~s is contracted
-with beta once, when the first garment reaches the node, into a compact copy of the rows that this garment needs; then
-one kernel finds a point's cell, reads its eight rows, blends, corrects and skins.
+with beta once, when the first garment reaches the node, into a compact copy of the rows that this garment needs.  Every
+frame, kernels find the points' cells, turn each row that these need into its map of rest points, once and in the order
+of memory, and blend the maps of a point's eight rows: Eq. 7-8 are linear in the fields.
 """
 
 from abc import ABC, abstractmethod
@@ -16,12 +17,22 @@ from torch import Tensor
 from workbench.body.model import Body
 from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
-from workbench.collisions.posing_kernels import LANES, TRIPLES, find_leaves, joint_transforms, pose_points
+from workbench.collisions.posing_kernels import (
+    LANES,
+    SUMS,
+    TRIPLES,
+    blend_rows,
+    find_leaves,
+    joint_transforms,
+    mark_rows,
+    pose_points,
+)
 from workbench.geometry.closest_point import morton_order
 from workbench.geometry.warp_launch import Recorded, shared_array
 
-ROWS_INPUT = 4  # of `pose_points`: corners, then weights, then offsets
 CODES = 32767  # the largest integer of 16 bits
+LINE = 64  # bytes of a cache line
+NEVER = -1  # the frame of what no frame asked for
 SLACK = 5e-4  # metres by which the table's rounding can go beyond the fields
 
 
@@ -65,8 +76,10 @@ class NodeRows:
         self.step = (highest.clamp_min(1e-9) / CODES).numpy()  # of a displacement, metres
         self.child = grid.child.numpy().copy()  # of a leaf: -1, or -2 - its number here
         self.place = np.full(len(grid.values), -1, np.int32)  # of a node's row here
-        self.weights = np.empty((0, LANES * -(-layout.joints // LANES)), np.float32)
+        self.weights = np.empty((0, SUMS * -(-layout.joints // SUMS)), np.float32)
         self.offsets = np.empty((0, LANES * self.offset_chunks), np.int16)
+        self.asked = np.empty(0, np.int32)  # the last frame that asked for a row
+        self.maps = np.empty((0, LANES), np.float32)  # what the row was in that frame
         self.corners = np.empty((0, 8), np.int32)  # rows of a numbered leaf
         self.row_count = self.leaf_count = 0
 
@@ -76,11 +89,14 @@ class NodeRows:
         new = np.unique(nodes[self.place[nodes] < 0])
         rows, leaves = self.row_count + len(new), self.leaf_count + len(cells)
         self.weights, self.offsets = _with_room(self.weights, rows), _with_room(self.offsets, rows)
+        had, self.asked = len(self.asked), _with_room(self.asked, rows)
+        self.asked[had:] = NEVER
+        self.maps = _with_room(self.maps, rows)
         self.corners = _with_room(self.corners, leaves)
         values = self.fields.layout.split(self.fields.grid.values[torch.from_numpy(new).long()])
         self.weights[self.row_count : rows] = 0
         self.weights[self.row_count : rows, : self.fields.layout.joints] = values.weights.numpy()
-        shape = torch.einsum("k,nki->ni", self.betas, values.shape_directions)
+        shape = values.shape_directions.mT @ self.betas
         offsets = torch.cat([shape[:, None], values.pose_directions], dim=1).numpy() / self.step[:, None]
         self.offsets[self.row_count : rows] = in_chunks(
             np.rint(offsets).reshape(len(new), 3 * len(self.step)), self.offset_chunks
@@ -105,13 +121,21 @@ def _with_room(array: np.ndarray, count: int) -> np.ndarray:
     """The array itself where it has `count` rows, else a larger one that begins with it."""
     if count <= len(array):
         return array
-    larger = np.empty((max(count, len(array) + len(array) // 2), *array.shape[1:]), array.dtype)
+    larger = _on_lines((max(count, len(array) + len(array) // 2), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
 
 
+def _on_lines(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An empty array that begins with a cache line, as its rows then do where they fill some."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    room = np.empty(size + LINE, np.uint8)
+    begin = -room.ctypes.data % LINE
+    return room[begin : begin + size].view(dtype).reshape(shape)
+
+
 class TablePoser(FramePoser):
-    """By the table and one kernel; float32 on the CPU."""
+    """By the table and a few kernels; float32 on the CPU."""
 
     def __init__(self, body: Body, fields: GridFields, betas: Float[Tensor, "K"], points: int):
         joints, self.nodes = len(body.parents), NodeRows(body, fields, betas)
@@ -146,8 +170,10 @@ class TablePoser(FramePoser):
         low, shape = wp.vec3(*(float(x) for x in grid.low)), wp.vec3i(*grid.shape)
         child = shared_array(self.nodes.child, wp.int32)
         self._leaves = Recorded(find_leaves, points, order, X, low, grid.root_size, shape, child, leaf, local)
-        factors, posed = shared_array(self.factors, wp.float32), shared_array(self.posed, wp.vec3)
-        self._pose = Recorded(pose_points, points, order, X, local, leaf, *self._rows(), transforms, factors, posed)
+        self.frame = np.zeros(1, np.int32)  # how many there were, this one among them
+        self._pose_inputs = shared_array(self.frame, wp.int32), transforms, shared_array(self.factors, wp.float32)
+        self._point_inputs = order, X, local, leaf, shared_array(self.posed, wp.vec3)
+        self._record()
 
     def __call__(
         self, X: Float[Tensor, "N 3"], rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]
@@ -170,6 +196,9 @@ class TablePoser(FramePoser):
         self._leaves()
         if self.leaf.min(initial=0) < 0:
             self._learn()
+        self.frame += 1
+        self._mark()
+        self._blend()
         self._pose()
         return torch.from_numpy(self.posed.copy())
 
@@ -177,20 +206,23 @@ class TablePoser(FramePoser):
         """Read the rows that this frame is the first to need."""
         unknown = self.leaf < 0
         cells = -1 - self.leaf[unknown]
-        before = self.nodes.weights, self.nodes.corners
+        before = self.nodes.maps, self.nodes.corners
         self.nodes.add(np.unique(cells))
         self.leaf[unknown] = -2 - self.nodes.child[cells]
-        if before[0] is not self.nodes.weights or before[1] is not self.nodes.corners:  # they moved to have more room
-            for index, array in enumerate(self._rows()):
-                self._pose.replace(ROWS_INPUT + index, array)
+        if before[0] is not self.nodes.maps or before[1] is not self.nodes.corners:  # they moved to have more room
+            self._record()
 
-    def _rows(self) -> tuple[wp.array, wp.array, wp.array]:
-        nodes = self.nodes
-        return (
-            shared_array(nodes.corners, wp.int32, 2),
-            shared_array(nodes.weights, wp.float32, 2),
-            shared_array(nodes.offsets, wp.int16, 2),
-        )
+    def _record(self) -> None:
+        """The launches that read rows, on the arrays as they are."""
+        nodes, count = self.nodes, len(self.leaf)
+        frame, transforms, factors = self._pose_inputs
+        order, X, local, leaf, posed = self._point_inputs
+        corners, asked = shared_array(nodes.corners, wp.int32, 2), shared_array(nodes.asked, wp.int32)
+        weights, offsets = shared_array(nodes.weights, wp.float32, 2), shared_array(nodes.offsets, wp.int16, 2)
+        maps = shared_array(nodes.maps, wp.float32, 2)
+        self._mark = Recorded(mark_rows, count, leaf, corners, frame, asked)
+        self._blend = Recorded(blend_rows, 1, frame, asked, weights, offsets, transforms, factors, maps)
+        self._pose = Recorded(pose_points, count, order, X, local, leaf, corners, maps, posed)
 
 
 def frame_poser(model: GarmentModel, betas: Float[Tensor, "K"], points: int) -> FramePoser:

@@ -86,6 +86,28 @@ def mix_patches(
     patch_block(wp.tid(), blocks_a_patch, blocks, amounts, values)
 
 
+_ADD_AND_RECTIFY = """
+    const int size = values.shape[1];
+    float* const value = values.data + size_t(row) * size;
+    const float* const of_all = common.data;
+    const float* const of_it = own.data + size_t(row) * size;
+    #pragma clang loop vectorize(assume_safety)
+    for (int i = 0; i < size; ++i) {
+        const float sum = value[i] + of_all[i] + of_it[i];
+        value[i] = sum > 0 ? sum : 0;
+    }
+"""
+
+
+@wp.func_native(_ADD_AND_RECTIFY)
+def add_and_rectify(
+    row: int,
+    common: wp.array(dtype=wp.float32),
+    own: wp.array2d(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
+): ...
+
+
 @wp.kernel
 def add_rectify_and_normalise(
     common: wp.array(dtype=wp.float32),
@@ -97,6 +119,5 @@ def add_rectify_and_normalise(
 ):
     """Of one patch: what all patches and what it alone has is added; ReLU and LayerNorm, in place."""
     row = wp.tid()
-    for i in range(values.shape[1]):
-        values[row, i] = wp.max(values[row, i] + common[i] + own[row, i], 0.0)
+    add_and_rectify(row, common, own, values)
     normalise(row, scale, shift, epsilon, values)

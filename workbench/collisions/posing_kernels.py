@@ -1,9 +1,14 @@
 # pyright: basic, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
-"""Warp kernels of one posed frame (Eq. 7-8): skeleton, leaf cells, points.  Compiled at first use, cached by Warp."""
+"""Warp kernels of one posed frame (Eq. 7-8): skeleton, leaf cells, rows, points.  Compiled at first use, then cached.
+
+On the CPU the items of a launch come one after the other, so that each can fetch what a later one reads.
+"""
 
 import warp as wp
 
 LANES = 16  # floats a chunk: one cache line
+SUMS = 4  # a row has a multiple of so many weights
+AHEAD = wp.constant(4)  # points; what is read then is on its way while a point is worked on
 TRIPLES = 5  # displacements (x, y, z) a chunk, one float to spare
 
 wp.set_module_options({"enable_backward": False})
@@ -75,49 +80,109 @@ def find_leaves(
     leaf[i] = wp.where(down == -1, -1 - index, -2 - down)
 
 
-# In C++, with the compiler's vector type: the same loops in Warp's Python took four times as long.  `following` is the
-# leaf of the next point: its rows are on their way while this point is posed.
-_POSED_POINT = """
+_MARK_ROWS = """
+    const int* corner = corners.data;
+    __builtin_prefetch(corner + 8 * later);
+    for (int k = 0; k < 8; ++k) asked.data[corner[8 * cell + k]] = frame;
+"""
+
+
+@wp.func_native(_MARK_ROWS)
+def marked_rows(
+    cell: int, later: int, frame: int, corners: wp.array2d(dtype=wp.int32), asked: wp.array(dtype=wp.int32)
+): ...
+
+
+@wp.kernel
+def mark_rows(
+    leaf: wp.array(dtype=wp.int32),
+    corners: wp.array2d(dtype=wp.int32),
+    frame: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.int32),
+):
+    """Note the frame at every row that one of its points blends."""
+    i = wp.tid()
+    marked_rows(leaf[i], leaf[wp.min(i + AHEAD, leaf.shape[0] - 1)], frame[0], corners, asked)
+
+
+# In C++, with the compiler's vector type: the same loops in Warp's Python took four times as long.
+_BLEND_ROWS = """
     typedef float lanes __attribute__((vector_size(64), aligned(4)));
     typedef short codes __attribute__((vector_size(32), aligned(2)));
-    const int weight_chunks = weights.shape[1] / 16, offset_chunks = offsets.shape[1] / 16;
-    const float* weight_rows = weights.data;
-    const short* offset_rows = offsets.data;
-    const lanes* weight_row[8];
-    const codes* offset_row[8];
-    float share[8];
-    for (int k = 0; k < 8; ++k) {
-        const size_t node = corners.data[8 * cell + k], next = corners.data[8 * following + k];
-        for (int chunk = 0; chunk < weight_chunks; ++chunk)
-            __builtin_prefetch(weight_rows + 16 * (next * weight_chunks + chunk));
-        for (int chunk = 0; chunk < offset_chunks; chunk += 2)
-            __builtin_prefetch(offset_rows + 16 * (next * offset_chunks + chunk));
-        weight_row[k] = reinterpret_cast<const lanes*>(weight_rows + 16 * node * weight_chunks);
-        offset_row[k] = reinterpret_cast<const codes*>(offset_rows + 16 * node * offset_chunks);
-        share[k] = (k & 4 ? u[0] : 1 - u[0]) * (k & 2 ? u[1] : 1 - u[1]) * (k & 1 ? u[2] : 1 - u[2]);
-    }
+    typedef float quad __attribute__((vector_size(16), aligned(4)));
+    const int rows = asked.shape[0], joints = weights.shape[1], chunks = offsets.shape[1] / 16;
     const lanes* joint = reinterpret_cast<const lanes*>(transforms.data);
-    lanes blended[4] = {};  // four sums, so that additions need not wait for each other
-    for (int chunk = 0; chunk < weight_chunks; ++chunk, joint += 16) {
-        lanes weight = {};
-        for (int k = 0; k < 8; ++k) weight += share[k] * weight_row[k][chunk];
-        for (int lane = 0; lane < 16; ++lane) blended[lane % 4] += weight[lane] * joint[lane];
-    }
-    const lanes affine = (blended[0] + blended[1]) + (blended[2] + blended[3]);
     const lanes* factor = reinterpret_cast<const lanes*>(factors.data);
-    lanes offset = {};
-    for (int chunk = 0; chunk < offset_chunks; ++chunk) {
-        lanes part = {};
-        for (int k = 0; k < 8; ++k) part += share[k] * __builtin_convertvector(offset_row[k][chunk], lanes);
-        offset += part * factor[chunk];
+    for (size_t row = 0; row < rows; ++row) {
+        const size_t later = row + 8;  // on its way while this one is worked on
+        if (later < rows && asked.data[later] == frame) {
+            const short* of_later = offsets.data + 16 * later * chunks;
+            for (int j = 0; j < joints; j += 16) __builtin_prefetch(weights.data + later * joints + j);
+            for (int chunk = 0; chunk < chunks; chunk += 2) __builtin_prefetch(of_later + 16 * chunk);
+        }
+        if (asked.data[row] != frame) continue;
+        const float* weight = weights.data + row * joints;
+        const codes* code = reinterpret_cast<const codes*>(offsets.data + 16 * row * chunks);
+        lanes part[4] = {};  // four sums, so that additions need not wait for each other
+        for (int j = 0; j < joints; j += 4)
+            for (int i = 0; i < 4; ++i) part[i] += weight[j + i] * joint[j + i];
+        lanes offset = {};
+        for (int chunk = 0; chunk < chunks; ++chunk)
+            offset += __builtin_convertvector(code[chunk], lanes) * factor[chunk];
+        float sums[16];
+        __builtin_memcpy(sums, &offset, sizeof(offset));
+        quad moved = {};
+        for (int triple = 0; triple < 5; ++triple) moved += *reinterpret_cast<const quad*>(sums + 3 * triple);
+        float* map = maps.data + 16 * row;
+        *reinterpret_cast<lanes*>(map) = (part[0] + part[1]) + (part[2] + part[3]);
+        *reinterpret_cast<quad*>(map + 12) = moved;
+    }
+"""
+
+
+@wp.func_native(_BLEND_ROWS)
+def blended_rows(
+    frame: int,
+    asked: wp.array(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.float32),
+    offsets: wp.array2d(dtype=wp.int16),
+    transforms: wp.array2d(dtype=wp.float32),
+    factors: wp.array(dtype=wp.float32),
+    maps: wp.array2d(dtype=wp.float32),
+): ...
+
+
+@wp.kernel
+def blend_rows(
+    frame: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.float32),
+    offsets: wp.array2d(dtype=wp.int16),
+    transforms: wp.array2d(dtype=wp.float32),
+    factors: wp.array(dtype=wp.float32),
+    maps: wp.array2d(dtype=wp.float32),
+):
+    """The maps of the rows that this frame asks for: sum_j W~_j T_j as (R | t), then B~s + B~p.  One item.
+
+    A row: weights, a multiple of SUMS; displacements as integers in chunks of TRIPLES; `factors` has what each
+    displacement's integers are multiplied with, three times, and 0 for what is to spare.  Rows are read in the order in
+    which they lie."""
+    blended_rows(frame[0], asked, weights, offsets, transforms, factors, maps)
+
+
+_POSED_POINT = """
+    typedef float lanes __attribute__((vector_size(64), aligned(4)));
+    for (int k = 0; k < 8; ++k) __builtin_prefetch(maps.data + 16 * size_t(corners.data[8 * later + k]));
+    lanes map = {};
+    for (int k = 0; k < 8; ++k) {
+        const float share = (k & 4 ? u[0] : 1 - u[0]) * (k & 2 ? u[1] : 1 - u[1]) * (k & 1 ? u[2] : 1 - u[2]);
+        map += share * reinterpret_cast<const lanes*>(maps.data)[corners.data[8 * cell + k]];
     }
     float moved[3];
-    for (int i = 0; i < 3; ++i)
-        moved[i] = X[i] + (((offset[i] + offset[i + 3]) + (offset[i + 6] + offset[i + 9])) + offset[i + 12]);
+    for (int i = 0; i < 3; ++i) moved[i] = X[i] + map[12 + i];
     wp::vec3 posed;
     for (int i = 0; i < 3; ++i)
-        posed[i] = affine[4 * i] * moved[0] + affine[4 * i + 1] * moved[1] + affine[4 * i + 2] * moved[2]
-            + affine[4 * i + 3];
+        posed[i] = map[4 * i] * moved[0] + map[4 * i + 1] * moved[1] + map[4 * i + 2] * moved[2] + map[4 * i + 3];
     return posed;
 """
 
@@ -127,12 +192,9 @@ def posed_point(
     X: wp.vec3,
     u: wp.vec3,
     cell: int,
-    following: int,
+    later: int,
     corners: wp.array2d(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.float32),
-    offsets: wp.array2d(dtype=wp.int16),
-    transforms: wp.array2d(dtype=wp.float32),
-    factors: wp.array(dtype=wp.float32),
+    maps: wp.array2d(dtype=wp.float32),
 ) -> wp.vec3: ...
 
 
@@ -143,26 +205,13 @@ def pose_points(
     local: wp.array(dtype=wp.vec3),
     leaf: wp.array(dtype=wp.int32),
     corners: wp.array2d(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.float32),
-    offsets: wp.array2d(dtype=wp.int16),
-    transforms: wp.array2d(dtype=wp.float32),
-    factors: wp.array(dtype=wp.float32),
+    maps: wp.array2d(dtype=wp.float32),
     posed: wp.array(dtype=wp.vec3),
 ):
-    """M_G = (sum_j W~_j T_j) (X + B~s + B~p)      (Eq. 7-8), fields interpolated between the corners of the leaf.
+    """M_G = (sum_j W~_j T_j) (X + B~s + B~p)      (Eq. 7-8), both factors interpolated between the leaf's corners.
 
-    A node's row: weights in whole chunks of LANES, and displacements as integers in chunks of TRIPLES; `factors` has
-    what each displacement's integers are multiplied with, three times, and 0 for what is to spare."""
+    Both are linear in the fields, so that it does not matter that rows were blended before; there are half as many
+    rows as corners of all points."""
     i = wp.tid()
     n = order[i]
-    posed[n] = posed_point(
-        points[n],
-        local[i],
-        leaf[i],
-        leaf[wp.min(i + 1, order.shape[0] - 1)],
-        corners,
-        weights,
-        offsets,
-        transforms,
-        factors,
-    )
+    posed[n] = posed_point(points[n], local[i], leaf[i], leaf[wp.min(i + AHEAD, leaf.shape[0] - 1)], corners, maps)

@@ -22,8 +22,3 @@ class Recorded:
 
     def __call__(self) -> None:
         self.command.launch()
-
-    def replace(self, index: int, array: wp.array) -> None:
-        """Another array for one input."""
-        self.inputs[index] = array
-        self.command.set_param_at_index(index, array)
