@@ -93,14 +93,14 @@ class NodeRows:
         self.asked[had:] = NEVER
         self.maps = _with_room(self.maps, rows)
         self.corners = _with_room(self.corners, leaves)
-        values = self.fields.layout.split(self.fields.grid.values[torch.from_numpy(new).long()])
+        # in numpy: of so few numbers, torch's calls would take longer than the work
+        layout, values = self.fields.layout, self.fields.grid.values.numpy()[new]
+        weights, shape, pose = np.split(values, (layout.joints, layout.joints + 3 * layout.shapes), axis=1)
         self.weights[self.row_count : rows] = 0
-        self.weights[self.row_count : rows, : self.fields.layout.joints] = values.weights.numpy()
-        shape = values.shape_directions.mT @ self.betas
-        offsets = torch.cat([shape[:, None], values.pose_directions], dim=1).numpy() / self.step[:, None]
-        self.offsets[self.row_count : rows] = in_chunks(
-            np.rint(offsets).reshape(len(new), 3 * len(self.step)), self.offset_chunks
-        )
+        self.weights[self.row_count : rows, : layout.joints] = weights
+        shape = self.betas.numpy() @ shape.reshape(len(new), layout.shapes, 3)
+        offsets = np.concatenate([shape, pose], axis=1) / np.repeat(self.step, 3)
+        self.offsets[self.row_count : rows] = in_chunks(np.rint(offsets), self.offset_chunks)
         self.place[new] = np.arange(self.row_count, rows, dtype=np.int32)
         self.corners[self.leaf_count : leaves] = self.place[nodes]
         self.child[cells] = -2 - np.arange(self.leaf_count, leaves, dtype=np.int32)

@@ -86,6 +86,23 @@ def mix_patches(
     patch_block(wp.tid(), blocks_a_patch, blocks, amounts, values)
 
 
+@wp.kernel
+def spread_patches(
+    begins: wp.array(dtype=wp.int32),
+    places: wp.array(dtype=wp.int32),
+    windows: wp.array(dtype=wp.float32),
+    values: wp.array(dtype=wp.float32),
+    offsets: wp.array(dtype=wp.vec3),
+):
+    """Of each vertex, what its patches say, weighted: entries begins[n] to begins[n + 1] of `places` and `windows`."""
+    n = wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(begins[n], begins[n + 1]):
+        place = places[k]
+        total += windows[k] * wp.vec3(values[place], values[place + 1], values[place + 2])
+    offsets[n] = total
+
+
 _ADD_AND_RECTIFY = """
     const int size = values.shape[1];
     float* const value = values.data + size_t(row) * size;

@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from workbench.collisions.limb_kernels import add_rectify_and_normalise, mix_patches, see_limbs
+from workbench.collisions.limb_kernels import add_rectify_and_normalise, mix_patches, see_limbs, spread_patches
 from workbench.collisions.limb_sight import FAR
 from workbench.collisions.network_kernels import LANES, dense, gru_step, rectify_and_normalise
 from workbench.collisions.posed_corrective import FEATURE_SCALE, MILLI, REACH, PosedCorrective
@@ -144,6 +144,7 @@ class KernelCorrective:
         count, joints, rank = len(corrective.patches), corrective.joints, len(corrective.basis)
         self.rotations, self.rest = np.empty((joints, 3, 3), np.float32), np.empty((joints, 3), np.float32)
         self.anchors, self.features = np.empty((count, 3), np.float32), np.empty((count, sight.size), np.float32)
+        self.unturned = np.eye(3, dtype=np.float32)
         self.shape = np.full(corrective.shapes, np.nan, np.float32)  # whose joints and anchors these are
         world, places = wp.zeros(joints, wp.mat33, device="cpu"), wp.zeros(joints, wp.vec3, device="cpu")
         transforms = wp.zeros((joints, LANES), wp.float32, device="cpu")
@@ -173,16 +174,29 @@ class KernelCorrective:
         self.last, self.last_own = corrective.last.numpy() / scale, corrective.last_own.numpy() / scale
         self.amounts = np.empty((count, rank), np.float32)
         self.values = np.empty((count, size), np.float32)
-        self.points = corrective.patches.vertices.shape[1]
-        self.mixing = Recorded(
-            mix_patches,
-            blocks.size // (LANES * rank),
-            size // LANES,
-            shared_array(blocks, wp.float16),
-            shared_array(self.amounts, wp.float32, 2),
-            shared_array(self.values.reshape(-1), wp.float32),
-        )
-        self.matrix = corrective.patches.matrix
+        values, amounts = shared_array(self.values.reshape(-1), wp.float32), shared_array(self.amounts, wp.float32, 2)
+        spread, points = corrective.patches.matrix, corrective.patches.vertices.shape[1]
+        places = size * (spread.indices // points) + 3 * (spread.indices % points)
+        self.offset = np.empty((spread.shape[0], 3), np.float32)
+        self.mixing = [
+            Recorded(
+                mix_patches,
+                blocks.size // (LANES * rank),
+                size // LANES,
+                shared_array(blocks, wp.float16),
+                amounts,
+                values,
+            ),
+            Recorded(
+                spread_patches,
+                len(self.offset),
+                shared_array(spread.indptr.astype(np.int32), wp.int32),
+                shared_array(places.astype(np.int32), wp.int32),
+                shared_array(spread.data.astype(np.float32), wp.float32),
+                values,
+                shared_array(self.offset, wp.vec3),
+            ),
+        ]
 
     def __call__(
         self, rotations: Float[Tensor, "*B J 3 3"], betas: Float[Tensor, "*B K"], latent: Float[Tensor, "*B L"]
@@ -193,7 +207,7 @@ class KernelCorrective:
             self.shape = betas.numpy().copy()
             self.rest[:], self.anchors[:] = (found.numpy() for found in self.corrective.sight.at_rest(betas))
         self.rotations[:] = rotations.numpy()
-        self.rotations[0] = np.eye(3)
+        self.rotations[0] = self.unturned
         for call in self.seeing:
             call()
         np.matmul(FEATURE_SCALE * np.concatenate([self.shape, latent.numpy()]), self.own, out=self.common[0])
@@ -203,8 +217,9 @@ class KernelCorrective:
         self.rectifying[1]()
         np.matmul(self.hidden[1][:, None], self.last, out=self.amounts[:, None])
         self.amounts += self.last_own
-        self.mixing()
-        offset = self.matrix @ self.values[:, : 3 * self.points].reshape(-1, 3)
+        for call in self.mixing:
+            call()
+        offset = self.offset
         size = math.sqrt(float(np.vdot(offset, offset)) / len(offset)) / MILLI  # metres: `within_reach` of one frame
         return torch.from_numpy(offset * np.float32(REACH / max(size, REACH) / MILLI))
 
