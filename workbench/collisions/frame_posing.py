@@ -19,6 +19,7 @@ from workbench.collisions.diffused_body import GridFields
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.posing_kernels import (
     LANES,
+    SOME,
     SUMS,
     TRIPLES,
     blend_rows,
@@ -169,7 +170,8 @@ class TablePoser(FramePoser):
         grid = fields.grid.compact
         low, shape = wp.vec3(*(float(x) for x in grid.low)), wp.vec3i(*grid.shape)
         child = shared_array(self.nodes.child, wp.int32)
-        self._leaves = Recorded(find_leaves, points, order, X, low, grid.root_size, shape, child, leaf, local)
+        groups = -(-points // SOME)
+        self._leaves = Recorded(find_leaves, groups, order, X, low, grid.root_size, shape, child, leaf, local)
         self.frame = np.zeros(1, np.int32)  # how many there were, this one among them
         self._pose_inputs = shared_array(self.frame, wp.int32), transforms, shared_array(self.factors, wp.float32)
         self._point_inputs = order, X, local, leaf, shared_array(self.posed, wp.vec3)

@@ -8,6 +8,7 @@ import warp as wp
 
 LANES = 16  # floats a chunk: one cache line
 SUMS = 4  # a row has a multiple of so many weights
+SOME = 8  # points that look for their leaves together
 AHEAD = wp.constant(4)  # points; what is read then is on its way while a point is worked on
 TRIPLES = 5  # displacements (x, y, z) a chunk, one float to spare
 
@@ -41,6 +42,63 @@ def joint_transforms(
             transforms[j, 4 * i + 3] = t[i]
 
 
+# In C++, as the others below: a point's way down a tree is a chain of reads, so that some points go side by side.
+_LEAVES_OF_SOME = """
+    const int first = SOME * block, points_left = order.shape[0] - first;
+    const int count = points_left < SOME ? points_left : SOME;
+    const int* down = child.data;
+    float u[SOME][3];
+    int cell[SOME];
+    for (int p = 0; p < count; ++p) {
+        const wp::vec3 x = (points.data[order.data[first + p]] - low) / root_size;
+        cell[p] = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            const float most = (float)shape[axis];
+            const float clamped = x[axis] < 0 ? 0 : x[axis] > most ? most : x[axis];
+            const int whole = (int)clamped < shape[axis] - 1 ? (int)clamped : shape[axis] - 1;
+            u[p][axis] = clamped - (float)whole;
+            cell[p] = cell[p] * shape[axis] + whole;
+        }
+        __builtin_prefetch(down + cell[p]);
+    }
+    for (bool split = true; split;) {
+        split = false;
+        for (int p = 0; p < count; ++p) {
+            const int begin = down[cell[p]];
+            if (begin < 0) continue;
+            int octant = 0;
+            for (int axis = 0; axis < 3; ++axis) {
+                const float doubled = 2 * u[p][axis];
+                const int upper = (int)doubled < 1 ? (int)doubled : 1;
+                u[p][axis] = doubled - (float)upper;
+                octant = 2 * octant + upper;
+            }
+            cell[p] = begin + octant;
+            __builtin_prefetch(down + cell[p]);
+            split = true;
+        }
+    }
+    for (int p = 0; p < count; ++p) {
+        local.data[first + p] = wp::vec3(u[p][0], u[p][1], u[p][2]);
+        leaf.data[first + p] = down[cell[p]] == -1 ? -1 - cell[p] : -2 - down[cell[p]];
+    }
+"""
+
+
+@wp.func_native(_LEAVES_OF_SOME.replace("SOME", str(SOME)))
+def leaves_of_some(
+    block: int,
+    order: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    low: wp.vec3,
+    root_size: float,
+    shape: wp.vec3i,
+    child: wp.array(dtype=wp.int32),
+    leaf: wp.array(dtype=wp.int32),
+    local: wp.array(dtype=wp.vec3),
+): ...
+
+
 @wp.kernel
 def find_leaves(
     order: wp.array(dtype=wp.int32),
@@ -53,31 +111,11 @@ def find_leaves(
     local: wp.array(dtype=wp.vec3),
 ):
     """The number of the leaf cell and the local coordinates in [0, 1]^3 of the points order[0], order[1], ..., clamped
-    to the box.
+    to the box; an item for every SOME of them.
 
     `child` holds the first child of a split cell, -2 - number of a leaf, or -1 for a leaf that has no number yet;
     for such a leaf the result is -1 - cell."""
-    i = wp.tid()
-    x = (points[order[i]] - low) / root_size
-    u = wp.vec3(0.0, 0.0, 0.0)
-    index = int(0)  # noqa: UP018  a variable for Warp, not a constant
-    for axis in range(3):
-        clamped = wp.clamp(x[axis], 0.0, float(shape[axis]))
-        whole = wp.min(int(clamped), shape[axis] - 1)
-        u[axis] = clamped - float(whole)
-        index = index * shape[axis] + whole
-    down = child[index]
-    while down >= 0:
-        octant = int(0)  # noqa: UP018
-        for axis in range(3):
-            doubled = 2.0 * u[axis]
-            upper = wp.min(int(doubled), 1)
-            u[axis] = doubled - float(upper)
-            octant = 2 * octant + upper
-        index = down + octant
-        down = child[index]
-    local[i] = u
-    leaf[i] = wp.where(down == -1, -1 - index, -2 - down)
+    leaves_of_some(wp.tid(), order, points, low, root_size, shape, child, leaf, local)
 
 
 _MARK_ROWS = """

@@ -227,6 +227,9 @@ class TryOnStream:
         self.pose = frame_poser(tryon.model, betas, tryon.subspace.vertex_count)
         self.describe = DescriptorStream(tryon.regressor.describe, tryon.regressor.fps)
         self.hidden = torch.zeros(LAYERS, 1, HIDDEN)
+        # in numpy: of so few numbers, torch's calls would take longer than the work
+        self.of_shape = betas.numpy()
+        self.centre, self.size = tryon.regressor.centre.numpy(), tryon.regressor.size.numpy()
 
     @torch.no_grad()
     def __call__(self, rotations: Float[Tensor, "J 3 3"], translation: Float[Tensor, "3"]) -> Frame:
@@ -237,12 +240,11 @@ class TryOnStream:
         tryon = self.tryon
         if len(rotations) != tryon.regressor.joints:
             raise ValueError(f"the frame has {len(rotations)} joints, but the networks {tryon.regressor.joints}")
-        if not (bool(torch.isfinite(rotations).all()) and bool(torch.isfinite(translation).all())):
+        if not (np.isfinite(rotations.numpy()).all() and np.isfinite(translation.numpy()).all()):
             raise ValueError(f"frame {self.describe.frame} holds NaN or infinity; leave it out or repeat the last one")
-        gamma = self.describe(rotations, translation)
-        regressor = tryon.regressor
-        inputs = ((torch.cat([gamma, self.betas]) - regressor.centre) / regressor.size).clamp(-5, 5)
-        latent, self.hidden = tryon.networks.regress(inputs, self.hidden)
+        gamma = self.describe(rotations, translation).numpy()
+        inputs = np.clip((np.concatenate([gamma, self.of_shape]) - self.centre) / self.size, -5, 5)
+        latent, self.hidden = tryon.networks.regress(torch.from_numpy(inputs), self.hidden)
         X = tryon.networks.decode(latent)
         if tryon.corrective is not None:
             X = X + tryon.corrective(rotations, self.betas, latent)
