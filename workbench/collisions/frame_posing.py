@@ -60,10 +60,10 @@ class ModelPoser(FramePoser):
 
 
 class NodeRows:
-    """The rows of those nodes of the table that were asked for, in whole chunks.
+    """The rows of those nodes of the table that were asked for.
 
-    W~; B~s, contracted with beta, beside the directions of B~p, as integers of 16 bits times a step each (an
-    error of a few micrometres at most).
+    W~ where it is not zero; B~s, contracted with beta, beside the directions of B~p, as integers of 16 bits times a step
+    each (an error of a few micrometres at most), in whole chunks.
     Grows by need; it never holds more rows than the table has nodes.
     """
 
@@ -77,7 +77,9 @@ class NodeRows:
         self.step = (highest.clamp_min(1e-9) / CODES).numpy()  # of a displacement, metres
         self.child = grid.child.numpy().copy()  # of a leaf: -1, or -2 - its number here
         self.place = np.full(len(grid.values), -1, np.int32)  # of a node's row here
-        self.weights = np.empty((0, SUMS * -(-layout.joints // SUMS)), np.float32)
+        # the joints that carry a row, and their W~; where those of each row begin, at last where they end
+        self.carriers, self.weights = np.empty(0, np.uint16), np.empty(0, np.float32)
+        self.begins = np.zeros(1, np.int32)
         self.offsets = np.empty((0, LANES * self.offset_chunks), np.int16)
         self.asked = np.empty(0, np.int32)  # the last frame that asked for a row
         self.maps = np.empty((0, LANES), np.float32)  # what the row was in that frame
@@ -89,7 +91,7 @@ class NodeRows:
         nodes = self.fields.grid.corner.numpy()[cells]
         new = np.unique(nodes[self.place[nodes] < 0])
         rows, leaves = self.row_count + len(new), self.leaf_count + len(cells)
-        self.weights, self.offsets = _with_room(self.weights, rows), _with_room(self.offsets, rows)
+        self.offsets = _with_room(self.offsets, rows)
         had, self.asked = len(self.asked), _with_room(self.asked, rows)
         self.asked[had:] = NEVER
         self.maps = _with_room(self.maps, rows)
@@ -97,8 +99,7 @@ class NodeRows:
         # in numpy: of so few numbers, torch's calls would take longer than the work
         layout, values = self.fields.layout, self.fields.grid.values.numpy()[new]
         weights, shape, pose = np.split(values, (layout.joints, layout.joints + 3 * layout.shapes), axis=1)
-        self.weights[self.row_count : rows] = 0
-        self.weights[self.row_count : rows, : layout.joints] = weights
+        self._carry(weights, rows)
         shape = self.betas.numpy() @ shape.reshape(len(new), layout.shapes, 3)
         offsets = np.concatenate([shape, pose], axis=1) / np.repeat(self.step, 3)
         self.offsets[self.row_count : rows] = in_chunks(np.rint(offsets), self.offset_chunks)
@@ -106,6 +107,27 @@ class NodeRows:
         self.corners[self.leaf_count : leaves] = self.place[nodes]
         self.child[cells] = -2 - np.arange(self.leaf_count, leaves, dtype=np.int32)
         self.row_count, self.leaf_count = rows, leaves
+
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What kernels read and write; others than before where they had to have more room."""
+        return self.corners, self.asked, self.begins, self.carriers, self.weights, self.offsets, self.maps
+
+    def _carry(self, weights: Float[np.ndarray, "n J"], rows: int) -> None:
+        """Append W~ of new rows, up to `rows` of them, without the zeros but for those that fill the last SUMS."""
+        carried = weights != 0
+        counts = carried.sum(1)
+        filled = SUMS * -(-counts // SUMS)
+        self.begins = _with_room(self.begins, rows + 1)
+        first = int(self.begins[self.row_count])
+        ends = first + np.cumsum(filled)
+        self.begins[self.row_count + 1 : rows + 1] = ends
+        last = first + int(filled.sum())
+        self.carriers, self.weights = _with_room(self.carriers, last), _with_room(self.weights, last)
+        self.carriers[first:last], self.weights[first:last] = 0, 0
+        row, joint = np.nonzero(carried)
+        to_spare = (ends - filled) - (np.cumsum(counts) - counts)  # and what came before
+        place = to_spare[row] + np.arange(len(row))
+        self.carriers[place], self.weights[place] = joint, weights[row, joint]
 
 
 def in_chunks(triples: Float[np.ndarray, "n C"], chunks: int) -> Float[np.ndarray, "n D"]:
@@ -151,7 +173,7 @@ class TablePoser(FramePoser):
         self.factor_map = in_chunks(pose_map, self.nodes.offset_chunks)
         self.factor_rest = in_chunks(step[None, :3], self.nodes.offset_chunks)[0]
         self.factors = self.factor_rest.copy()
-        self.transforms = np.zeros((self.nodes.weights.shape[1], LANES), np.float32)
+        self.transforms = np.zeros((joints, LANES), np.float32)
         local = shared_array(np.empty((points, 3), np.float32), wp.vec3)
         leaf = shared_array(self.leaf, wp.int32)
         order, X = shared_array(self.order, wp.int32), shared_array(self.points, wp.vec3)
@@ -208,10 +230,10 @@ class TablePoser(FramePoser):
         """Read the rows that this frame is the first to need."""
         unknown = self.leaf < 0
         cells = -1 - self.leaf[unknown]
-        before = self.nodes.maps, self.nodes.corners
+        before = self.nodes.arrays()
         self.nodes.add(np.unique(cells))
         self.leaf[unknown] = -2 - self.nodes.child[cells]
-        if before[0] is not self.nodes.maps or before[1] is not self.nodes.corners:  # they moved to have more room
+        if any(now is not then for now, then in zip(self.nodes.arrays(), before, strict=True)):  # for more room
             self._record()
 
     def _record(self) -> None:
@@ -220,10 +242,11 @@ class TablePoser(FramePoser):
         frame, transforms, factors = self._pose_inputs
         order, X, local, leaf, posed = self._point_inputs
         corners, asked = shared_array(nodes.corners, wp.int32, 2), shared_array(nodes.asked, wp.int32)
-        weights, offsets = shared_array(nodes.weights, wp.float32, 2), shared_array(nodes.offsets, wp.int16, 2)
-        maps = shared_array(nodes.maps, wp.float32, 2)
+        begins, carriers = shared_array(nodes.begins, wp.int32), shared_array(nodes.carriers, wp.uint16)
+        weights, offsets = shared_array(nodes.weights, wp.float32), shared_array(nodes.offsets, wp.int16, 2)
+        rows, maps = (begins, carriers, weights, offsets), shared_array(nodes.maps, wp.float32, 2)
         self._mark = Recorded(mark_rows, count, leaf, corners, frame, asked)
-        self._blend = Recorded(blend_rows, 1, frame, asked, weights, offsets, transforms, factors, maps)
+        self._blend = Recorded(blend_rows, 1, frame, asked, *rows, transforms, factors, maps)
         self._pose = Recorded(pose_points, count, order, X, local, leaf, corners, maps, posed)
 
 

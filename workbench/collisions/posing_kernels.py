@@ -7,7 +7,7 @@ On the CPU the items of a launch come one after the other, so that each can fetc
 import warp as wp
 
 LANES = 16  # floats a chunk: one cache line
-SUMS = 4  # a row has a multiple of so many weights
+SUMS = 4  # a row has a multiple of so many weights, some of them 0
 SOME = 8  # points that look for their leaves together
 AHEAD = wp.constant(4)  # points; what is read then is on its way while a point is worked on
 TRIPLES = 5  # displacements (x, y, z) a chunk, one float to spare
@@ -148,22 +148,22 @@ _BLEND_ROWS = """
     typedef float lanes __attribute__((vector_size(64), aligned(4)));
     typedef short codes __attribute__((vector_size(32), aligned(2)));
     typedef float quad __attribute__((vector_size(16), aligned(4)));
-    const int rows = asked.shape[0], joints = weights.shape[1], chunks = offsets.shape[1] / 16;
+    const int rows = asked.shape[0], chunks = offsets.shape[1] / 16;
     const lanes* joint = reinterpret_cast<const lanes*>(transforms.data);
     const lanes* factor = reinterpret_cast<const lanes*>(factors.data);
     for (size_t row = 0; row < rows; ++row) {
         const size_t later = row + 8;  // on its way while this one is worked on
         if (later < rows && asked.data[later] == frame) {
             const short* of_later = offsets.data + 16 * later * chunks;
-            for (int j = 0; j < joints; j += 16) __builtin_prefetch(weights.data + later * joints + j);
+            __builtin_prefetch(weights.data + begins.data[later]);
+            __builtin_prefetch(carriers.data + begins.data[later]);
             for (int chunk = 0; chunk < chunks; chunk += 2) __builtin_prefetch(of_later + 16 * chunk);
         }
         if (asked.data[row] != frame) continue;
-        const float* weight = weights.data + row * joints;
         const codes* code = reinterpret_cast<const codes*>(offsets.data + 16 * row * chunks);
         lanes part[4] = {};  // four sums, so that additions need not wait for each other
-        for (int j = 0; j < joints; j += 4)
-            for (int i = 0; i < 4; ++i) part[i] += weight[j + i] * joint[j + i];
+        for (int k = begins.data[row]; k < begins.data[row + 1]; k += 4)
+            for (int i = 0; i < 4; ++i) part[i] += weights.data[k + i] * joint[carriers.data[k + i]];
         lanes offset = {};
         for (int chunk = 0; chunk < chunks; ++chunk)
             offset += __builtin_convertvector(code[chunk], lanes) * factor[chunk];
@@ -182,7 +182,9 @@ _BLEND_ROWS = """
 def blended_rows(
     frame: int,
     asked: wp.array(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.float32),
+    begins: wp.array(dtype=wp.int32),
+    carriers: wp.array(dtype=wp.uint16),
+    weights: wp.array(dtype=wp.float32),
     offsets: wp.array2d(dtype=wp.int16),
     transforms: wp.array2d(dtype=wp.float32),
     factors: wp.array(dtype=wp.float32),
@@ -194,7 +196,9 @@ def blended_rows(
 def blend_rows(
     frame: wp.array(dtype=wp.int32),
     asked: wp.array(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.float32),
+    begins: wp.array(dtype=wp.int32),
+    carriers: wp.array(dtype=wp.uint16),
+    weights: wp.array(dtype=wp.float32),
     offsets: wp.array2d(dtype=wp.int16),
     transforms: wp.array2d(dtype=wp.float32),
     factors: wp.array(dtype=wp.float32),
@@ -202,10 +206,10 @@ def blend_rows(
 ):
     """The maps of the rows that this frame asks for: sum_j W~_j T_j as (R | t), then B~s + B~p.  One item.
 
-    A row: weights, a multiple of SUMS; displacements as integers in chunks of TRIPLES; `factors` has what each
-    displacement's integers are multiplied with, three times, and 0 for what is to spare.  Rows are read in the order in
-    which they lie."""
-    blended_rows(frame[0], asked, weights, offsets, transforms, factors, maps)
+    A row: the joints that carry it and how much, from begins[row] to begins[row + 1]; displacements as integers in
+    chunks of TRIPLES; `factors` has what each displacement's integers are multiplied with, three times, and 0 for what
+    is to spare.  Rows are read in the order in which they lie."""
+    blended_rows(frame[0], asked, begins, carriers, weights, offsets, transforms, factors, maps)
 
 
 _POSED_POINT = """

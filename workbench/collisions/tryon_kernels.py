@@ -177,7 +177,7 @@ class KernelCorrective:
         values, amounts = shared_array(self.values.reshape(-1), wp.float32), shared_array(self.amounts, wp.float32, 2)
         spread, points = corrective.patches.matrix, corrective.patches.vertices.shape[1]
         places = size * (spread.indices // points) + 3 * (spread.indices % points)
-        self.offset = np.empty((spread.shape[0], 3), np.float32)
+        self.offset = np.empty((corrective.vertex_count, 3), np.float32)
         self.mixing = [
             Recorded(
                 mix_patches,
