@@ -62,8 +62,8 @@ class ModelPoser(FramePoser):
 class NodeRows:
     """The rows of those nodes of the table that were asked for.
 
-    W~ where it is not zero; B~s, contracted with beta, beside the directions of B~p, as integers of 16 bits times a step
-    each (an error of a few micrometres at most), in whole chunks.
+    W~ where it is not zero; B~s, contracted with beta, beside the directions of B~p, as integers of 16 bits times a
+    step each (an error of a few micrometres at most), in whole chunks.
     Grows by need; it never holds more rows than the table has nodes.
     """
 
