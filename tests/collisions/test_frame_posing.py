@@ -124,3 +124,20 @@ def test_unusable_points_are_refused(body, model):
         pose(torch.zeros(5, 3), rotations, translation)
     with pytest.raises(ValueError, match="1 of the garment's canonical vertices are NaN"):
         pose(torch.tensor([[0, 0, torch.nan], [0, 0, 0], [0, 0, 0], [0, 0, 0]]), rotations, translation)
+
+
+def test_a_row_holds_what_the_table_holds(body, model):
+    _, _, betas = random_pose(body, 11)
+    nodes = TablePoser(body, model.fields, betas, 1).nodes
+    chance = np.random.default_rng(11)
+    leaves = np.flatnonzero(nodes.child == -1)
+    for count in (300, 1, 40):  # rows are added to rows
+        nodes.add(chance.choice(leaves[nodes.child[leaves] == -1], count, replace=False))
+    rows = nodes.place[nodes.place >= 0]
+    wanted = model.fields.layout.split(model.fields.grid.values[np.flatnonzero(nodes.place >= 0)]).weights.numpy()
+    found = np.zeros_like(wanted)
+    for place, row in enumerate(rows):
+        of_row = slice(nodes.begins[row], nodes.begins[row + 1])
+        np.add.at(found[place], nodes.carriers[of_row], nodes.weights[of_row])
+    np.testing.assert_array_equal(found, wanted)
+    assert sorted(rows) == list(range(nodes.row_count))
