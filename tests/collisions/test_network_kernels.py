@@ -22,7 +22,8 @@ def test_rows_are_rectified_and_normalised(width):
 
     def wanted(rows: np.ndarray) -> np.ndarray:
         rectified = torch.from_numpy(rows).double().clamp_min(0)
-        return layer_norm(rectified, (width,), *(torch.from_numpy(v).double() for v in (scale, shift)), 1e-3).numpy()
+        weight, bias = (torch.from_numpy(vector).double() for vector in (scale, shift))
+        return layer_norm(rectified, (width,), weight, bias, 1e-3).numpy()
 
     found = values.copy()
     Recorded(rectify_and_normalise, ROWS, *vectors, 1e-3, shared_array(found, wp.float32, 2))()
