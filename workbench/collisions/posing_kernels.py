@@ -161,16 +161,16 @@ _BLEND_ROWS = """
         }
         if (asked.data[row] != frame) continue;
         const codes* code = reinterpret_cast<const codes*>(offsets.data + 16 * row * chunks);
-        lanes part[4] = {};  // four sums, so that additions need not wait for each other
-        for (int k = begins.data[row]; k < begins.data[row + 1]; k += 4)
-            for (int i = 0; i < 4; ++i) part[i] += weights.data[k + i] * joint[carriers.data[k + i]];
+        lanes part[SUMS] = {};  // so that additions need not wait for each other
+        for (int k = begins.data[row]; k < begins.data[row + 1]; k += SUMS)
+            for (int i = 0; i < SUMS; ++i) part[i] += weights.data[k + i] * joint[carriers.data[k + i]];
         lanes offset = {};
         for (int chunk = 0; chunk < chunks; ++chunk)
             offset += __builtin_convertvector(code[chunk], lanes) * factor[chunk];
-        float sums[16];
-        __builtin_memcpy(sums, &offset, sizeof(offset));
+        float triples[16];
+        __builtin_memcpy(triples, &offset, sizeof(offset));
         quad moved = {};
-        for (int triple = 0; triple < 5; ++triple) moved += *reinterpret_cast<const quad*>(sums + 3 * triple);
+        for (int triple = 0; triple < 5; ++triple) moved += *reinterpret_cast<const quad*>(triples + 3 * triple);
         float* map = maps.data + 16 * row;
         *reinterpret_cast<lanes*>(map) = (part[0] + part[1]) + (part[2] + part[3]);
         *reinterpret_cast<quad*>(map + 12) = moved;
@@ -178,7 +178,7 @@ _BLEND_ROWS = """
 """
 
 
-@wp.func_native(_BLEND_ROWS)
+@wp.func_native(_BLEND_ROWS.replace("SUMS", str(SUMS)))
 def blended_rows(
     frame: int,
     asked: wp.array(dtype=wp.int32),

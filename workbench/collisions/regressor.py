@@ -41,6 +41,7 @@ from workbench.learning.scalar_log import ScalarLog, read_curves
 log = logging.getLogger(__name__)
 
 HIDDEN, LAYERS = 500, 2  # facts.md 1
+FARTHEST_INPUT = 5  # standard deviations: inputs are clipped there
 FORMAT = "regressor-1"
 
 
@@ -105,11 +106,11 @@ class Regressor(nn.Module):
     def inputs(
         self, rotations: Float[Tensor, "B T J 3 3"], translation: Float[Tensor, "B T 3"], betas: Float[Tensor, "B K"]
     ) -> Float[Tensor, "B T I"]:
-        """gamma and beta of every frame, standardised; the root's motion is clipped at 5 standard deviations."""
+        """gamma and beta of every frame, standardised; clipped at FARTHEST_INPUT."""
         moving = global_motion(rotations[..., 0, :, :], translation, self.fps).stacked()
         gamma = descriptor(self.describe(rotations), moving, self.fps)
         together = torch.cat([gamma, betas[:, None].expand(*gamma.shape[:2], -1)], dim=-1)
-        return ((together - self.centre) / self.size).clamp(-5, 5)
+        return ((together - self.centre) / self.size).clamp(-FARTHEST_INPUT, FARTHEST_INPUT)
 
     def forward(
         self, rotations: Float[Tensor, "B T J 3 3"], translation: Float[Tensor, "B T 3"], betas: Float[Tensor, "B K"]

@@ -24,7 +24,7 @@ from workbench.collisions.frame_posing import frame_poser
 from workbench.collisions.garment_model import GarmentModel
 from workbench.collisions.motion_descriptor import DescriptorStream
 from workbench.collisions.posed_corrective import PosedCorrective
-from workbench.collisions.regressor import HIDDEN, LAYERS, Regressor
+from workbench.collisions.regressor import FARTHEST_INPUT, HIDDEN, LAYERS, Regressor
 from workbench.collisions.subspace import SHIPPED, Subspace
 from workbench.formats import load_motion
 from workbench.garments import Garment
@@ -243,7 +243,8 @@ class TryOnStream:
         if not (np.isfinite(rotations.numpy()).all() and np.isfinite(translation.numpy()).all()):
             raise ValueError(f"frame {self.describe.frame} holds NaN or infinity; leave it out or repeat the last one")
         gamma = self.describe(rotations, translation).numpy()
-        inputs = np.clip((np.concatenate([gamma, self.of_shape]) - self.centre) / self.size, -5, 5)
+        inputs = (np.concatenate([gamma, self.of_shape]) - self.centre) / self.size
+        inputs = np.clip(inputs, -FARTHEST_INPUT, FARTHEST_INPUT)
         latent, self.hidden = tryon.networks.regress(torch.from_numpy(inputs), self.hidden)
         X = tryon.networks.decode(latent)
         if tryon.corrective is not None:
